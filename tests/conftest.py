@@ -8,6 +8,10 @@ import pytest
 import rooms
 from consistency import contradictions_of_line, find_contradictions, lines_of_results
 
+from piccolo.cloud.readers import e57, las, mesh, reader, text
+from piccolo.files import cache
+from piccolo.jobs.memory import limit_memory
+from piccolo.kernels import jit
 from piccolo.result import Result
 
 # A shell starts what runs in the background with Ctrl-C ignored, as then would be what a test starts.
@@ -75,6 +79,37 @@ def _shared_folder(tmp_path_factory):
     """The temporary folder of the run, above that of the worker if there are several."""
     folder = tmp_path_factory.getbasetemp()
     rooms.SHARED[:] = [folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder]
+
+
+@pytest.fixture
+def read_by(monkeypatch):
+    """Let files of points be read in chunks of so many points, and those of text in so many bytes."""
+
+    def shrink(num_points, num_bytes=text.BLOCK):
+        for module in (reader, las, e57, mesh):
+            monkeypatch.setattr(module, "CHUNK", num_points)
+        monkeypatch.setattr(text, "BLOCK", num_bytes)
+
+    return shrink
+
+
+@pytest.fixture
+def home_cache(tmp_path, monkeypatch):
+    """The user's folder for what is kept between runs, empty, and trusted or not as it is found then."""
+    found = (cache.cache_root, cache.private_folder, jit.kernel_folder, jit.warn_not_kept, jit.warn_damaged)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    for each in found:
+        each.cache_clear()
+    yield tmp_path / "home" / "piccolo"
+    for each in found:
+        each.cache_clear()
+
+
+@pytest.fixture
+def limiting():
+    """Set the memory [GB] that this process may take, until the test ends."""
+    yield limit_memory
+    limit_memory(None)
 
 
 @pytest.fixture(scope="session")

@@ -1,39 +1,32 @@
-"""Made-up hypotheses and what speaks for them, for tests in which one rule decides."""
+"""Made-up candidates and what speaks for them, for tests in which one rule decides."""
 
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-from piccolo.localization.query import Cache, Features, Query
 
 from piccolo.confidence.alternatives import Hypothesis
-from piccolo.evidence.comparison import FINE_VIEW, Comparison
 from piccolo.geometry.pose import Pose, yaw_rotation
-from piccolo.jobs.threads import Once, Workers
-from piccolo.judge import selection
-from piccolo.local_features.keypoints import join_keypoints
-from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import last_descent
+from piccolo.judge.candidate import Candidate, Comparison, Selection
+from piccolo.local_features.matching import Matches
 from piccolo.optimize.channel_loss import CHANCE
-from piccolo.problem.settings import CoarseToFineSettings
+from piccolo.photo import NOTHING_KNOWN
+from piccolo.problem.problem import Problem
+from piccolo.problem.profile import PROFILES
 
-WHOLE = SimpleNamespace(is_partial=False, has_tilt=False)  # photos, of which nothing else is asked
-PARTIAL = SimpleNamespace(is_partial=True, has_tilt=False)
-TILTED_WHOLE = SimpleNamespace(is_partial=False, has_tilt=True)
-TILTED_PARTIAL = SimpleNamespace(is_partial=True, has_tilt=True)
+WHOLE, PARTIAL, WHOLE_SHAPE, PARTIAL_SHAPE = PROFILES
 VIEWS = SimpleNamespace(averages=lambda *_: None, points=lambda *_: None, surroundings=lambda *_: None)
-NO_FEATURES = Once(lambda: Features(join_keypoints([]), NO_MATCHES))
-QUERY = Query(
+PROBLEM = Problem(  # of a photo of which nothing else is asked
     source=None,
     given=None,
-    photo=WHOLE,
+    photo=SimpleNamespace(has_tilt=False),
     colors=lambda: None,
     scan_map=SimpleNamespace(octree=None, to_world=lambda pose: pose, has_shape=False),
-    settings=CoarseToFineSettings(),
-    workers=Workers(1),
-    features=(NO_FEATURES, NO_FEATURES),
-    evidence="drawn scan",
-    cache=Cache(VIEWS),
+    views=VIEWS,
+    profile=WHOLE,
+    prior=NOTHING_KNOWN,
+    gravity="auto",
+    features=("half", "other half"),
 )
 
 
@@ -41,12 +34,31 @@ def at(x, score, yaw_deg=0.0):
     return Hypothesis(Pose(yaw_rotation(np.radians(yaw_deg)), np.array([x, 0.0, 0.0])), score)
 
 
+def make_candidate(x, score, num_matches=0, explains=None, yaw_deg=0.0, **evidence):
+    """A candidate at x with its evidence; it explains as much as its score says, unless told otherwise."""
+    comparison = seen(score if explains is None else explains)
+    return Candidate(at(x, score, yaw_deg).pose, score, comparison, num_matches=num_matches, **evidence)
+
+
+def make_selection(best, *others, rival_ratio=0.0):
+    """A selection of candidates, the best first."""
+    return Selection(best, others, rival_ratio)
+
+
+def move(candidate, metres, score=None):
+    """A candidate with the same evidence farther along x, perhaps with another score."""
+    pose = replace(candidate.pose, center_world=candidate.pose.center_world + np.array([metres, 0.0, 0.0]))
+    if score is None:
+        return replace(candidate, pose=pose)
+    return replace(candidate, pose=pose, score=score, seen=seen(score))
+
+
 def place(pose):
     return round(float(pose.center_world[0]), 6)
 
 
-def places(hypotheses):
-    return [place(h.pose) for h in hypotheses]
+def places(candidates):
+    return [place(h.pose) for h in candidates]
 
 
 def seen(explains, num_blocks=4):
@@ -56,13 +68,20 @@ def seen(explains, num_blocks=4):
     return Comparison(np.full(num_blocks, beyond), area, area, 0.01 * num_blocks)
 
 
-def compared(monkeypatch, explains, counts):
-    """A query with made-up comparisons, and made-up counts of matches, by the x of a pose."""
-
-    def count_each(query, best, others):
-        return [counts.get(place(h.pose), 0) for h in (best, *others)]
-
-    for module in (selection, last_descent):
-        monkeypatch.setattr(module, "count_each", count_each)
-    known = {(at(x, 0.0).pose.key, FINE_VIEW): seen(part) for x, part in explains.items()}
-    return replace(QUERY, cache=Cache(VIEWS, known))
+def exact_matches(pose, count, num_wrong=0, seed=0):
+    """Matches that a camera at the pose would have, seen from right there; the last ones of any points."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-3, 3, (count, 3))
+    directions = points - pose.center_world
+    ranges = np.linalg.norm(directions, axis=1)
+    directions /= ranges[:, None]
+    tangents = np.cross(directions, rng.normal(size=(count, 3)))
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    angles = rng.uniform(0.02, 0.2, count)
+    rays, ray_tangents = directions @ pose.R_cam_from_world.T, tangents @ pose.R_cam_from_world.T
+    wrong = slice(count - num_wrong, count)
+    points[wrong] = rng.uniform(-3, 3, (num_wrong, 3))
+    values = rays, ray_tangents, angles, points, directions, tangents, angles * ranges
+    some = [np.asarray(a, np.float32) for a in values]
+    weights = rng.choice(np.float32([0.5, 1.0]), count)
+    return Matches(np.arange(count, dtype=np.int32), *some, weights)

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from piccolo.problem.problem import prepare_problem
 
 from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.soa import pack_points
@@ -18,8 +17,10 @@ from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.geometry.pose import Pose, angle_between
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization.localize import localize
+from piccolo.localization.means import Means, Trace
 from piccolo.opened_scan import OpenedScan
 from piccolo.panorama import Panorama
+from piccolo.problem.problem import prepare_problem
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.scan import Scan
 from piccolo.scan_map.map_file import load_map, save_map
@@ -31,6 +32,7 @@ from research.synthetic.world import make_query, make_world, scan_world
 SIZE = (4.5, 3.5, 2.5)
 NUM_POINTS = 60_000
 WIDTH = 512
+WORKERS = Workers(2)
 SHARED = []  # the folder that all workers of a run have in common; conftest.py puts it in
 AUTO, KNOWN, UNKNOWN = (CoarseToFineSettings(gravity=gravity) for gravity in ("auto", "known", "unknown"))
 
@@ -111,9 +113,25 @@ def as_panorama(rgb):
     return Panorama(rgb, np.ones(rgb.shape[:2], dtype=bool))
 
 
-def ask(panorama, scan_map, settings=AUTO, num_threads=2):
-    """The query of a panorama in a map."""
-    return prepare_query(panorama, scan_map, settings, Workers(num_threads))
+def ask(panorama, scan_map, settings=AUTO):
+    """The problem of a panorama in a map."""
+    return prepare_problem(panorama, scan_map, settings.prior, settings.gravity)
+
+
+def means(settings=AUTO, workers=WORKERS):
+    """With what a photo is searched; its steps are noted."""
+    return Means(settings.effort, workers, Stopwatch(), Trace(is_wanted=True))
+
+
+def listen():
+    """Workers of one thread, and a list of what they are asked to do, and how often."""
+    asked = []
+
+    def show(values, total, label):
+        asked.append((label, total))
+        yield from values
+
+    return Workers(1, show), asked
 
 
 def locate(panorama, scan_map, settings=AUTO, num_threads=2):

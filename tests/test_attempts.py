@@ -1,32 +1,42 @@
 """Which photos whole views alone are enough for, how much search others need, and what the result says."""
 
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rooms
-from made_up import PARTIAL, QUERY, TILTED_PARTIAL, TILTED_WHOLE, WHOLE, at, compared, place, places
-from piccolo.localization.photo import ACROSS
+from made_up import PARTIAL, PROBLEM, WHOLE, exact_matches, make_candidate, make_selection, places
 
 from piccolo.confidence.confidence import LOCALIZED
-from piccolo.evidence.verification import Verified
+from piccolo.evidence.examine import examine
+from piccolo.evidence.verification import round_pose
 from piccolo.geometry.nearness import RIGHT
-from piccolo.geometry.pose import exp_so3
-from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.geometry.pose import Pose, exp_so3, step
+from piccolo.jobs.threads import Once, Stopwatch, Workers
+from piccolo.judge.candidate import Drawn
 from piccolo.judge.selection import is_clear
+from piccolo.local_features.keypoints import join_keypoints
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import attempts, beam, localize as method, query
+from piccolo.localization import attempts, beam, localize as method
 from piccolo.localization.search import search_poses
-from piccolo.panorama import GPano
+from piccolo.panorama import GPano, Panorama
 from piccolo.photo import Prior
-from piccolo.problem.settings import CoarseToFineSettings
+from piccolo.problem.photo_images import ACROSS
+from piccolo.problem.problem import Features
+from piccolo.problem.settings import CoarseToFineSettings, Effort
+from research.synthetic.world import mask_outside_field
+
+EFFORT = rooms.KNOWN.effort
+NO_FEATURES = Once(lambda workers: Features(join_keypoints([]), NO_MATCHES))
 
 
-def _localized(panorama, settings=rooms.KNOWN):
-    return method.localize(rooms.scan_map(1), panorama, settings, Workers(1), Stopwatch())
+def _localized(panorama, settings=rooms.KNOWN, scan_map=None):
+    return method.localize(scan_map or rooms.scan_map(1), panorama, settings, Workers(1), Stopwatch())
 
 
-def _query(panorama, settings=rooms.KNOWN):
+def _problem(panorama, settings=rooms.KNOWN):
     return rooms.ask(panorama, rooms.scan_map(1), settings)
 
 
@@ -35,10 +45,10 @@ def _turned_over(panorama):
     return replace(panorama, rgb=rgb, is_valid=is_valid)
 
 
-def test_a_clear_photo_needs_no_features_and_the_result_says_so(monkeypatch):
+def test_a_clear_photo_needs_no_features_and_the_result_says_so():
     taken = rooms.query(1)
-    monkeypatch.setattr(query, "match", lambda *_: pytest.fail("features of a clear photo"))
-    found = _localized(rooms.as_panorama(taken.rgb))
+    late = Once(lambda workers: pytest.fail("features of a clear photo"))
+    found = _localized(rooms.as_panorama(taken.rgb), scan_map=replace(rooms.scan_map(1), late=late))
     assert found.status == LOCALIZED
     assert RIGHT.holds(found.pose, taken.pose)
     assert (found.evidence.num_matches, found.evidence.alternative_matches) == (None, None)
@@ -65,48 +75,47 @@ def test_features_are_asked_of_what_is_not_clear(how):
 
 
 @pytest.mark.parametrize(("score", "margin"), [(0.3, 0.51), (0.29, 0.51), (0.3, 0.49)])
-def test_clear_are_score_and_margin(monkeypatch, score, margin):
-    other = score * (1.0 - margin)
-    asked = compared(monkeypatch, {0.0: score, 3.0: other}, {}).by_views()
-    assert is_clear(asked, [at(0.0, score), at(3.0, other)]) == (score >= 0.3 and margin >= 0.5)
+def test_clear_are_score_and_margin(score, margin):
+    found = make_selection(make_candidate(0.0, score), make_candidate(3.0, score * (1.0 - margin)))
+    assert is_clear(WHOLE.by_views(), found) == (score >= 0.3 and margin >= 0.5)
 
 
-@pytest.mark.parametrize(
-    ("is_clear", "own", "is_enough", "num_asked"),
-    [(True, 0.55, True, 1), (True, 0.54, False, 1), (False, 0.9, False, 0)],
-)
-def test_of_a_clear_photo_the_mirrored_one_must_start_a_tenth_worse(
-    monkeypatch, is_clear, own, is_enough, num_asked
-):
+@pytest.mark.parametrize("is_turned", [False, True])
+def test_of_a_clear_photo_the_mirrored_one_must_start_a_tenth_worse(is_turned):
     """It is searched only where the photo is clear."""
-    asked = []
-    monkeypatch.setattr(attempts, "search_poses", lambda query, gravity: None)
-    monkeypatch.setattr(attempts, "refine_starts", lambda query, starts, beam: [at(3.0, 0.5)])
-    monkeypatch.setattr(attempts, "is_clear", lambda query, found: is_clear)
-    monkeypatch.setattr(attempts, "score_starts", lambda query, starts: own)
-    monkeypatch.setattr(attempts, "score_mirror", lambda query: asked.append(query) or 0.5)
-    found, is_done = attempts.look_first(QUERY, [at(0.0, 0.2)], Stopwatch())
-    assert places(found) == [0.0, 3.0]
-    assert (is_done, asked) == (is_enough, [QUERY] * num_asked)
+    panorama = rooms.as_panorama(rooms.query(1).rgb)
+    problem = _problem(_turned_over(panorama) if is_turned else panorama).by_views()
+    workers, asked = rooms.listen()
+    known = [examine(problem, step(rooms.scene(1)[2], np.array([0, 0, 2.0, 1.0, 0, 0])))]
+    found, is_done = attempts.look_first(problem, known, rooms.means(rooms.KNOWN, workers))
+    assert found[0] is known[0]
+    assert len(found) > 1
+    assert is_done == (not is_turned)
+    once, own = rooms.listen()
+    search_poses(problem, "known", EFFORT.brief(), once)
+    searched, by_one = ([label for label, _ in done].count("search") for done in (asked, own))
+    assert searched == (1 if is_turned else 2) * by_one
+    assert attempts.beats_mirror(0.55, 0.5)
+    assert not attempts.beats_mirror(0.54, 0.5)
 
 
-def test_the_mirrored_query_is_that_of_the_mirrored_photo():
+def test_the_mirrored_problem_is_that_of_the_mirrored_photo():
     """Its tilt is mirrored with it; where it heads, nothing is known."""
     panorama = rooms.as_panorama(rooms.query(1).rgb)
-    asked = _query(panorama, replace(rooms.KNOWN, prior=Prior(heading_deg=30.0)))
+    asked = replace(_problem(panorama), prior=Prior(heading_deg=30.0))
     photo = replace(asked.photo, R_cam_from_level=exp_so3(np.array([0.0, 0.3, 0.0])))
     tilted = replace(asked, photo=photo)
     mirror = tilted.mirror()
-    other = _query(_turned_over(panorama))
+    other = _problem(_turned_over(panorama))
     for own, expected in zip(mirror.photo.images, other.photo.images, strict=True):
         levels = (image().rgbx.view(np.uint8).astype(int) for image in (own, expected))
         assert np.abs(np.subtract(*levels)).max() <= 1
     np.testing.assert_array_equal(mirror.photo.small.rgbx, other.photo.small.rgbx)
     np.testing.assert_array_equal(mirror.photo.panorama.is_valid, other.photo.panorama.is_valid)
     R = exp_so3(np.array([0.1, -0.2, 0.3]))
-    (turned,) = tilted.with_rotations(R[None]).mirror().rotations
+    (turned,) = replace(tilted, rotations=R[None]).mirror().rotations
     np.testing.assert_allclose(turned, ACROSS @ R @ ACROSS)
-    assert mirror.settings.prior == Prior()
+    assert mirror.prior == Prior()
     d = np.array([0.6, -0.2, 0.77])
     across = np.array([1.0, -1.0, 1.0])
     np.testing.assert_allclose(
@@ -114,60 +123,56 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     )
 
 
-def test_gravity_and_gps_alone_exclude_no_pose_that_is_searched_for(monkeypatch):
-    monkeypatch.setattr(attempts, "search_poses", lambda *_: pytest.fail("a search beyond gravity"))
+def test_gravity_and_gps_alone_exclude_no_pose_that_is_searched_for():
     told = replace(rooms.as_panorama(rooms.query(1).rgb), gpano=GPano(0.0, 0.0))
-    asked = _query(told, replace(rooms.KNOWN, prior=Prior(use_gps=False)))
-    assert attempts.search_beyond_prior(asked, rooms.scan_map(1), Stopwatch()) == []
+    asked = _problem(told, replace(rooms.KNOWN, prior=Prior(use_gps=False)))
+    workers, done = rooms.listen()
+    assert attempts.search_beyond_prior(asked, rooms.scan_map(1), rooms.means(workers=workers)) == []
+    assert done == []
 
 
 def test_the_first_score_tells_a_photo_from_its_mirror():
-    asked = _query(rooms.as_panorama(rooms.query(1).rgb))
-    mirror = asked.mirror()
-    own, other = (beam.score_starts(q, search_poses(q, "known")) for q in (asked, mirror))
+    asked = _problem(rooms.as_panorama(rooms.query(1).rgb))
+    scores = []
+    for one in (asked, asked.mirror()):
+        starts = search_poses(one, "known", EFFORT, rooms.WORKERS)
+        scores.append(beam.score_starts(one, starts, rooms.WORKERS))
+    own, other = scores
     assert own > 1.5 * other > 0.0
 
 
-BRIEF = {"num_rotations": 1000, "max_starts": 300}
-
-
-@pytest.mark.parametrize(("gravity", "changes"), [("auto", BRIEF), ("unknown", {})])
-def test_a_tilted_sphere_without_features_is_found_by_whole_views(monkeypatch, gravity, changes):
+@pytest.mark.parametrize(("gravity", "is_brief"), [("auto", True), ("unknown", False)])
+def test_a_tilted_sphere_without_features_is_found_by_whole_views(gravity, is_brief):
     """With the gravity `auto`, where the upright search came first, by a brief search."""
-    made = []
-
-    def searched(query, tilts):
-        made.append((tilts, query.settings, len(query.scan_map.sparse)))
-        return search_poses(query, tilts)
-
-    monkeypatch.setattr(attempts, "search_poses", searched)
-    monkeypatch.setattr(query, "match", lambda *_: NO_MATCHES)
-    taken, settings = rooms.query(1, "tilt"), CoarseToFineSettings(gravity=gravity)
-    found = _localized(rooms.as_panorama(taken.rgb), settings)
-    assert RIGHT.holds(found.pose, taken.pose)
-    how, asked, num_searched = made[-1]
-    num_candidates = len(rooms.scan_map(1).sparse)
-    assert (how, asked) == ("any", replace(settings, **changes))
-    assert 0.3 < num_searched / num_candidates < 0.7 if changes else num_searched == num_candidates
+    taken = rooms.query(1, "tilt")
+    problem = _problem(rooms.as_panorama(taken.rgb), CoarseToFineSettings(gravity=gravity))
+    means = rooms.means()
+    found = method.find(replace(problem, features=(NO_FEATURES,) * 2), rooms.scan_map(1), means)
+    pose = found.problem.scan_map.to_world(found.selection.best.pose)
+    assert RIGHT.holds(pose, taken.pose)
+    last = [made for made in means.trace.steps if made["step"] == "attempt"][-1]
+    assert last["options"] == {"tilts": "any", "is_brief": is_brief}
+    assert last["is_enough"]
 
 
 def test_a_brief_search_keeps_what_little_a_prior_leaves():
     whole = rooms.scan_map(1)
     few = whole.narrow(np.arange(len(whole.sparse)) < 7)
-    asked = _query(rooms.as_panorama(rooms.query(1).rgb))
-    assert attempts.thin_query(replace(asked, scan_map=few)).scan_map.sparse.tolist() == few.sparse.tolist()
-    assert 0.3 < len(attempts.thin_query(asked).scan_map.sparse) / len(whole.sparse) < 0.7
+    asked = _problem(rooms.as_panorama(rooms.query(1).rgb))
+    assert attempts.thin_out(replace(asked, scan_map=few)).scan_map.sparse.tolist() == few.sparse.tolist()
+    assert 0.3 < len(attempts.thin_out(asked).scan_map.sparse) / len(whole.sparse) < 0.7
+    assert attempts.thin_effort(rooms.AUTO.effort) == Effort(48, 1000, 300)
 
 
-def _name_attempts(query):
-    found = attempts.plan_attempts(query)
-    return [(len(by.features), getattr(run, "__name__", None) or run.keywords) for by, run in found]
+def _list_attempts(problem):
+    planned = attempts.plan_attempts(problem)
+    return [(len(by.features), run.keywords if isinstance(run, partial) else run) for by, run in planned]
 
 
-LOOK = (0, "look_first")
-HALF = (1, "search_part")
-ALL = (2, "search_matches")
-DRAWN = (0, "draw_found")
+LOOK = (0, attempts.look_first)
+HALF = (1, attempts.search_part)
+ALL = (2, attempts.search_matches)
+DRAWN = (0, attempts.draw_found)
 FIRST_UPRIGHT = (0, {"tilts": "known"})
 FIRST_TILTED = (0, {"tilts": "any", "is_brief": True})
 UPRIGHT = (2, {"tilts": "known"})
@@ -176,100 +181,90 @@ TILTED = (2, {"tilts": "any", "is_brief": False})
 
 
 @pytest.mark.parametrize(
-    ("photo", "gravity", "expected"),
+    ("profile", "has_tilt", "gravity", "expected"),
     [
-        (WHOLE, "auto", [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, HALF, ALL]),
-        (WHOLE, "known", [LOOK, DRAWN, FIRST_UPRIGHT, HALF, ALL]),
-        (WHOLE, "unknown", [HALF, ALL, TILTED]),
-        (TILTED_WHOLE, "auto", [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, HALF, ALL]),
-        (PARTIAL, "auto", [HALF, ALL, ABOUT_LEVEL, TILTED]),
-        (PARTIAL, "known", [HALF, ALL, ABOUT_LEVEL]),
-        (PARTIAL, "unknown", [HALF, ALL, ABOUT_LEVEL, TILTED]),
-        (TILTED_PARTIAL, "auto", [HALF, ALL, UPRIGHT, TILTED]),
-        (TILTED_PARTIAL, "known", [HALF, ALL, UPRIGHT]),
+        (WHOLE, False, "auto", [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, HALF, ALL]),
+        (WHOLE, False, "known", [LOOK, DRAWN, FIRST_UPRIGHT, HALF, ALL]),
+        (WHOLE, False, "unknown", [HALF, ALL, TILTED]),
+        (WHOLE, True, "auto", [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, HALF, ALL]),
+        (PARTIAL, False, "auto", [HALF, ALL, ABOUT_LEVEL, TILTED]),
+        (PARTIAL, False, "known", [HALF, ALL, ABOUT_LEVEL]),
+        (PARTIAL, False, "unknown", [HALF, ALL, ABOUT_LEVEL, TILTED]),
+        (PARTIAL, True, "auto", [HALF, ALL, UPRIGHT, TILTED]),
+        (PARTIAL, True, "known", [HALF, ALL, UPRIGHT]),
     ],
 )
-def test_attempts_are_made_in_this_order(photo, gravity, expected):
+def test_attempts_are_made_in_this_order(profile, has_tilt, gravity, expected):
     """Photos of a part of the sphere are searched about level, unless their tilt is known."""
-    settings = CoarseToFineSettings(gravity=gravity)
-    query = replace(QUERY, photo=photo, settings=settings)
-    assert _name_attempts(query) == expected
+    photo = SimpleNamespace(has_tilt=has_tilt)
+    assert _list_attempts(replace(PROBLEM, profile=profile, photo=photo, gravity=gravity)) == expected
 
 
-@pytest.mark.parametrize(("photo", "upright"), [(WHOLE, "known"), (PARTIAL, "level")])
-def test_without_features_of_the_map_whole_views_are_searched_alone(photo, upright):
-    query = replace(QUERY, photo=photo, features=())
-    assert _name_attempts(query) == [(0, {"tilts": upright}), (0, {"tilts": "any", "is_brief": False})]
+@pytest.mark.parametrize(("profile", "upright"), [(WHOLE, "known"), (PARTIAL, "level")])
+def test_without_features_of_the_map_whole_views_are_searched_alone(profile, upright):
+    problem = replace(PROBLEM, profile=profile, features=())
+    assert _list_attempts(problem) == [(0, {"tilts": upright}), (0, {"tilts": "any", "is_brief": False})]
 
 
 @pytest.mark.parametrize(("sure", "num_made"), [(1, 1), (2, 2), (None, 3)])
-def test_attempts_are_made_until_one_is_sure(monkeypatch, sure, num_made):
+def test_attempts_are_made_until_one_is_sure(sure, num_made):
     """What is found adds up, and as many features are asked in the end as in the last attempt."""
 
-    def run(query, hypotheses, watch):
-        num = len(query.features)
-        return [*hypotheses, at(num, 0.5)], num == sure
+    def run(problem, known, means):
+        num = len(problem.features)
+        return [*known, make_candidate(num, 0.5)], num == sure
 
-    def plan(query):
-        return [(replace(query, features=query.features[:k]), run) for k in (1, 2, 0)]
-
-    monkeypatch.setattr(method, "plan_attempts", plan)
-    monkeypatch.setattr(method, "refine_best", lambda query, found: found)
-    monkeypatch.setattr(method, "fit_camera", lambda query, found: method.Found(query, found, None))
-    monkeypatch.setattr(method, "judge", lambda query, found, fit: (len(query.features), found))
-    how = rooms.AUTO, Workers(1), Stopwatch()
-    num_parts, found = method.localize(rooms.scan_map(1), rooms.scene(1)[1], *how)
+    planned = [(replace(PROBLEM, features=PROBLEM.features[:k]), run) for k in (1, 2, 0)]
+    asked, found = method.make_attempts(planned, rooms.means()._replace(trace=method.NO_TRACE))
     assert places(found) == [1, 2, 0][:num_made]
-    assert num_parts == places(found)[-1]
+    assert len(asked.features) == places(found)[-1]
 
 
 @pytest.mark.parametrize(
-    ("num_parts", "num_matches", "is_sure", "kept"),
+    ("num_parts", "num_matches", "has_rival", "is_added"),
     [
-        (1, 40, True, [9, 1]),
-        (1, 39, True, [9]),
-        (1, 40, False, [9]),
-        (1, None, True, [9]),
-        (2, 39, False, [9, 2]),
-        (2, 5, True, [9, 2]),
+        (1, 40, False, True),
+        (1, 39, False, False),
+        (1, 40, True, False),
+        (1, 3, False, False),
+        (2, 39, True, True),
+        (2, 39, False, True),
     ],
 )
-def test_half_of_the_features_count_where_these_leave_no_doubt(
-    monkeypatch, num_parts, num_matches, is_sure, kept
-):
+def test_half_of_the_features_count_where_these_leave_no_doubt(num_parts, num_matches, has_rival, is_added):
     """As many matches as a clear whole view is worth, and no pose of the first look near it."""
-    looked = at(9, 0.2)
-    monkeypatch.setattr(attempts, "match_poses", lambda query, watch: [] if num_matches is None else ["pose"])
-    monkeypatch.setattr(attempts, "count_matches", lambda matches, pose: num_matches)
-    monkeypatch.setattr(attempts, "is_sure", lambda query, found: found[0] is looked and is_sure)
-    monkeypatch.setattr(attempts, "refine_matches", lambda query, poses: [at(num_parts, 0.5)])
+    true = rooms.scene(1)[2]
+    matches = exact_matches(true, num_matches)
+    features = Once(lambda workers: Features(join_keypoints([]), matches))
+    problem = replace(_problem(rooms.scene(1)[1], rooms.UNKNOWN), features=(features,))
+    own = examine(problem, true)
+    looked = replace(own, pose=step(true, np.array([0, 0, 1.5, 2.0, 0, 0])), score=0.9, num_matches=11)
+    if has_rival:
+        looked = replace(looked, num_matches=200)
     search = attempts.search_part if num_parts == 1 else attempts.search_matches
-    found, is_enough = search(QUERY, [looked], Stopwatch())
-    assert places(found) == kept
-    assert is_enough == (is_sure and len(kept) == 2)
+    found, is_enough = search(problem, [looked], rooms.means())
+    assert found[0].pose is looked.pose
+    assert len(found) == 1 + is_added
+    assert is_enough == (is_added and not has_rival)
+    assert all(RIGHT.holds(h.pose, true) for h in found[1:])
 
 
-@pytest.mark.parametrize(
-    ("photo", "expected"),
-    [(PARTIAL, [*range(10), 1.5]), (TILTED_PARTIAL, [*range(10), 1.5]), (WHOLE, range(10))],
-)
-def test_poses_of_a_part_of_the_sphere_are_verified(monkeypatch, photo, expected):
+@pytest.mark.parametrize("is_partial", [True, False])
+def test_poses_of_a_part_of_the_sphere_are_verified(is_partial):
     """The best and eight alternatives; what matches more than chance does is added, scored where it went."""
-    num_matches = {0.0: 6, 1.0: 7, 9.0: 99}
-    asked = []
-    scored = []
-
-    def verify(query, pose):
-        asked.append(place(pose))
-        return Verified(at(place(pose) + 0.5, 0.0).pose, num_matches.get(place(pose), 0))
-
-    monkeypatch.setattr(attempts, "verify", verify)
-    monkeypatch.setattr(attempts, "score_pose", lambda _, pose: scored.append(place(pose)) or at(1.5, 0.7))
-    known = [at(k, 0.9 - 0.05 * k) for k in range(10)]
-    query = replace(QUERY, photo=photo)
-    found = attempts.add_verified(query, known)
-    assert places(found) == list(expected)
-    assert found[:10] == known
-    assert asked == (list(range(9)) if photo.is_partial else [])
-    assert scored == ([1.5] if photo.is_partial else [])
-    assert attempts.add_verified(query, []) == []
+    panorama = rooms.scene(1)[1]
+    width = panorama.rgb.shape[1]
+    narrow = Panorama(panorama.rgb, ~mask_outside_field(width, 70.0, 1.0))
+    problem = _problem(narrow if is_partial else panorama)
+    num_matches = {0: 6, 1: 7, 9: 99}
+    known = []
+    for k in range(10):
+        candidate = make_candidate(float(k), 0.9 - 0.05 * k)
+        moved = Pose(candidate.pose.R_cam_from_world, candidate.pose.center_world + np.array([0.1, 0.0, 0.0]))
+        drawn = Drawn(round_pose(candidate.pose)[0], exact_matches(moved, num_matches.get(k, 0)))
+        known.append(replace(candidate, drawn=drawn))
+    found = attempts.add_verified(problem, known, Workers(1))
+    assert all(one.pose is before.pose for one, before in zip(found, known, strict=False))
+    assert places(found[10:]) == pytest.approx([1.1] if is_partial else [], abs=1e-4)
+    assert [h.score for h in found[10:]] == [examine(problem, h.pose).score for h in found[10:]]
+    assert attempts.add_verified(problem, [], Workers(1)) == []

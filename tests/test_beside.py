@@ -6,21 +6,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rooms
-from test_verification import NUM_POINTS, _beside, _narrow, _query, _true_pose
+from test_verification import NUM_POINTS, _beside, _narrow, _problem, _true_pose
 
 from piccolo.confidence.localization import Localization
+from piccolo.evidence import verification
+from piccolo.evidence.focal_length import FocalFit
 from piccolo.geometry.pose import Pose
 from piccolo.geometry.pose_gaussian import LIKELY, PoseGaussian, subtract
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.judge.belief import make_belief
+from piccolo.judge.candidate import NOTHING
 from piccolo.judge.reasons import Reason
 from piccolo.local_features.hypotheses import exact_pose
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import verification
 from piccolo.localization.beside import Neighbor, SurePhoto, fuse, localize_beside
-from piccolo.localization.focal_length import FocalFit
-from piccolo.localization.localize import Found
-from piccolo.localization.selection import NOTHING
+from piccolo.localization.judging import Found
 from piccolo.photo import Prior
 
 
@@ -91,7 +91,7 @@ def _fused(judged, of_photo, settings=rooms.UNKNOWN, fit=None):
     matches = _matches_of(_true_pose(), 1e-3, np.random.default_rng(1))
     located = verification.Located(_beside().keypoints, _beside().ranges, of_photo.pose)
     other = Neighbor("b", SurePhoto(located, 0.99, of_photo), matches, _true_pose())
-    return fuse(judged, other, Found(replace(_query(), settings=settings), NOTHING, fit))
+    return fuse(judged, other, Found(replace(_problem(), prior=settings.prior), NOTHING, fit))
 
 
 def test_a_pose_is_averaged_with_that_by_a_photo_beside():

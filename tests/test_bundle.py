@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rooms
-from made_up import at, compared
+from made_up import PROBLEM, at
 from poses import tilted_poses
 
 from piccolo.confidence.localization import Alternative, Localization
@@ -16,6 +16,7 @@ from piccolo.geometry.pose import Pose, exp_so3, pose_errors, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.judge.belief import make_belief
+from piccolo.judge.candidate import Selection
 from piccolo.judge.reasons import Reason
 from piccolo.localization import bundle_search
 from piccolo.localization.bundle import (
@@ -23,11 +24,11 @@ from piccolo.localization.bundle import (
     NOT_FOUND,
     UNSEEN,
     compare_errors,
-    judge_member,
     localize_bundle,
+    place_member,
 )
 from piccolo.localization.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
-from piccolo.localization.selection import Selection
+from piccolo.localization.judging import Found
 from piccolo.panorama import Panorama
 from research.synthetic.world import mask_outside_field, photograph
 
@@ -47,9 +48,8 @@ def _alone(*probabilities):
     likely = list(zip(poses, probabilities, strict=True))
     alternatives = tuple(Alternative(h.pose, h.score, None, p) for h, p in likely[1:])
     alone = Localization(belief=make_belief(probabilities), pose=poses[0].pose, alternatives=alternatives)
-    return bundle_search.Member(
-        None, Selection(poses[0], tuple(poses[1:])), None, alone, tilted_poses(1, NEAR)[0]
-    )
+    found = Found(None, Selection(poses[0], tuple(poses[1:])), None)
+    return bundle_search.Member(found, alone, tilted_poses(1, NEAR)[0])
 
 
 MISSES = _support(0.0, is_found=False)
@@ -99,11 +99,10 @@ def test_sure_photos_elsewhere_speak_against_the_relative_poses():
 
 
 @pytest.mark.parametrize("std", [0.005, 0.06, 0.3])
-def test_a_certain_place_counts_whole_however_inexact_the_pose_is(monkeypatch, std):
+def test_a_certain_place_counts_whole_however_inexact_the_pose_is(std):
     """How exact it is counts once, in the end."""
-    query = compared(monkeypatch, {0.0: 0.6, 3.0: 0.02}, {0.0: 80})
-    query = replace(query, scan_map=SimpleNamespace(**vars(query.scan_map), sparse=range(100)))
-    best, other = at(0.0, 0.6), at(3.0, 0.02)
+    problem = replace(PROBLEM, scan_map=SimpleNamespace(sparse=range(100)))
+    best, other = make_candidate(0.0, 0.6, 80), make_candidate(3.0, 0.02)
     belief = make_belief([0.99, 0.001], within=0.5)
     gaussian = PoseGaussian(best.pose, np.diag([1e-6] * 3 + [std**2] * 3), np.zeros((6, 6)))
     alone = Localization(
@@ -113,25 +112,27 @@ def test_a_certain_place_counts_whole_however_inexact_the_pose_is(monkeypatch, s
         gaussian=gaussian,
         std_of_fit=0.005,
     )
-    member = bundle_search.Member(query, Selection(best, (other,)), None, alone, Pose(np.eye(3), np.zeros(3)))
-    support = bundle_search.find_support(member, query, Bundle(best.pose))
-    assert support.own is best
+    found = Found(problem, Selection(best, (other,)), None)
+    member = bundle_search.Member(found, alone, Pose(np.eye(3), np.zeros(3)))
+    support = bundle_search.find_support(member, problem, Bundle(best.pose), Workers())
+    assert support.own.pose is best.pose
     assert support.odds > 5e4
     assert [p for _, p in member.own_poses] == [0.99, 0.001]
 
 
 @pytest.mark.parametrize(("conflict", "is_measured"), [(5.0, True), (5.0, False), (3.0, True), (None, True)])
 def test_what_a_photo_rules_out_stays_so_unless_others_know_its_focal_length(conflict, is_measured):
-    query = SimpleNamespace(given=SimpleNamespace(focal_prior=SimpleNamespace(is_measured=is_measured)))
+    given = SimpleNamespace(focal_prior=SimpleNamespace(is_measured=is_measured))
     fit = conflict and SimpleNamespace(conflict=conflict)
     alone = Localization(belief=make_belief([0.9]).rule_out(Reason.MIRRORED), warnings=("mirrored",))
     member = _alone(0.9)
-    member = replace(member, query=query, fit=fit, alone=alone)
+    found = member.found._replace(problem=replace(PROBLEM, given=given), fit=fit)
+    member = replace(member, found=found, alone=alone)
     assert member.own_poses == []
     assert member.is_misplaced == (conflict == 5.0 and is_measured)
     if not member.is_misplaced:
         agreed = SimpleNamespace(warnings=("scale",))
-        result = judge_member(member, 0, SURE, agreed, [], np.array([1.0, 0.0]))
+        result = place_member(member, 0, SURE, agreed, np.array([1.0, 0.0]))
         assert result == replace(alone, warnings=("mirrored", "scale"))
 
 
@@ -163,7 +164,7 @@ def test_an_own_pose_far_from_the_one_expected_is_doubted():
 def _members(far):
     """Two photos whose common frame begins `far` [m] from them."""
     cams = [Pose(pose.R_cam_from_world, pose.center_world + far) for pose in tilted_poses(2, NEAR)]
-    return [bundle_search.Member(None, None, None, Localization(), cam) for cam in cams]
+    return [bundle_search.Member(Found(None, None, None), Localization(), cam) for cam in cams]
 
 
 @pytest.mark.parametrize("far", [0.0, 1e3])

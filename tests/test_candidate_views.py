@@ -11,7 +11,7 @@ from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
 from piccolo.panorama.local_normalization import LEVELS_PER_UNIT
-from piccolo.problem.settings import VIEWS
+from piccolo.problem.profile import VIEWS
 from piccolo.views import candidate_views, points_around
 from piccolo.views.candidate_views import SEARCH_VIEW, CandidateViews, render_views, render_wide
 from piccolo.views.points_around import visible_points
@@ -115,13 +115,13 @@ def _pose(*center):
     return Pose(yaw_rotation(0.3), np.array(center))
 
 
-def _query():
+def _problem():
     return rooms.ask(rooms.scene(1)[1], rooms.scan_map(1))
 
 
 def test_poses_near_one_place_share_what_is_drawn_and_no_others(monkeypatch):
-    query, drawn = _query(), []
-    octree = query.scan_map.octree
+    problem, drawn = _problem(), []
+    octree = problem.scan_map.octree
 
     def average_view(octree, place, config):
         drawn.append((place, config))
@@ -143,14 +143,17 @@ def test_poses_near_one_place_share_what_is_drawn_and_no_others(monkeypatch):
 
 
 def test_views_and_points_count_from_their_place():
-    query, pose = _query(), _pose(0.307, 0.191, 0.304)
+    problem, pose = _problem(), _pose(0.307, 0.191, 0.304)
     place = points_around.round_position(pose)
-    expected = rooms.view(query.scan_map.octree, place, FINE, FINE_CELLS)
-    points = visible_points(query.scan_map.octree, place, FULL, FINE_CELLS.tobytes(), EVERYWHERE, 30_000)
-    for found, wanted in ((query.view_at(pose, "fine"), expected), (query.view_at(pose, "points"), points)):
+    expected = rooms.view(problem.scan_map.octree, place, FINE, FINE_CELLS)
+    points = visible_points(problem.scan_map.octree, place, FULL, FINE_CELLS.tobytes(), EVERYWHERE, 30_000)
+    for found, wanted in (
+        (problem.view_at(pose, "fine"), expected),
+        (problem.view_at(pose, "points"), points),
+    ):
         for values, others in zip(found, wanted, strict=True):
             np.testing.assert_array_equal(values, others)
-    assert query.view_at(pose, "points") is query.view_at(_pose(0.3135, 0.1875, 0.302), "points")
+    assert problem.view_at(pose, "points") is problem.view_at(_pose(0.3135, 0.1875, 0.302), "points")
     moved = expected.around(pose.center_world)
     at, there = (cells.center_map[:, None] + cells.offsets for cells in (expected, moved))
     np.testing.assert_allclose(at, there, atol=1e-6)
@@ -159,11 +162,11 @@ def test_views_and_points_count_from_their_place():
 
 @pytest.mark.parametrize("shift", [0.0, 0.008])
 def test_points_depend_on_what_the_photo_shows(shift):
-    query, pose = _query(), _pose(0.3 + shift, 0.2, 0.3)
-    height, width = query.photo.panorama.is_valid.shape
-    half = query.mask(np.arange(width)[None] < np.full((height, 1), width // 2))
-    assert half.cache.views is query.cache.views
-    some, every = (asked.view_at(pose, "points") for asked in (half, query))
+    problem, pose = _problem(), _pose(0.3 + shift, 0.2, 0.3)
+    height, width = problem.photo.panorama.is_valid.shape
+    half = problem.show(problem.photo.mask(np.arange(width)[None] < np.full((height, 1), width // 2)))
+    assert half.views is problem.views
+    some, every = (asked.view_at(pose, "points") for asked in (half, problem))
     assert 0.3 < len(some.weights) / len(every.weights) <= 1.01
     azimuth = np.arctan2(*(pose.R_cam_from_world @ some.offsets)[1::-1])
     assert (azimuth < 0.1).mean() > 0.98

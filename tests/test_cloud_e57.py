@@ -11,7 +11,7 @@ from test_cloud_morton import read, seeded_cloud
 
 from piccolo.camera.photo_cameras import find_calibration
 from piccolo.cli import e57_images
-from piccolo.cloud.readers import e57, e57_file
+from piccolo.cloud.readers import e57_file
 from piccolo.cloud.readers.e57 import list_images, read_image
 from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import open_source
@@ -87,8 +87,8 @@ def test_spherical_coordinates_single_precision_and_scaled_integers(tmp_path):
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 1199, 1200, 1201])
-def test_chunks_hold_no_more_points_than_asked(tmp_path, monkeypatch, chunk):
-    monkeypatch.setattr(e57, "CHUNK", chunk)
+def test_chunks_hold_no_more_points_than_asked(tmp_path, read_by, chunk):
+    read_by(chunk)
     num_points = 30 if chunk == 1 else 1200
     raw = type(RAW)(RAW.points_world[:num_points], RAW.colors[:num_points])
     written = ScanToWrite(cartesian(raw) | colored(raw.colors), BYTES)
@@ -164,14 +164,14 @@ def test_scans_without_colors_are_left_out_beside_others(tmp_path):
         open_source(write(tmp_path / "b.e57", [plain]), IN_COLORS)
 
 
-def test_points_that_are_not_finite_are_handed_on_and_foreign_fields_change_nothing(tmp_path, monkeypatch):
+def test_points_that_are_not_finite_are_handed_on_and_foreign_fields_change_nothing(tmp_path, read_by):
     raw = type(RAW)(RAW.points_world.copy(), RAW.colors)
     raw.points_world[:3] = [[np.inf, 0.0, 0.0], [np.nan, 1.0, 1.0], [1.7e308, 1.7e308, 1.7e308]]
     written = ScanToWrite(cartesian(raw) | colored(), BYTES, rotation_wxyz=QUATERNION)
     path = write(tmp_path / "a.e57", [written])
     assert len(read_cloud(path).points) == 1197
     assert "3 points with NaN" in read_cloud(path).warnings[0]
-    monkeypatch.setattr(e57, "CHUNK", 100)
+    read_by(100)
     chunks = open_source(write(tmp_path / "a.e57", [scan(), scan()])).read_chunks()
     np.testing.assert_array_equal(next(chunks).points_world, RAW.points_world[:100])
     chunks.close()

@@ -175,11 +175,11 @@ def test_points_leave_no_gaps_and_no_clumps(tmp_path):
     np.testing.assert_allclose(weights.mean(axis=0), 1 / 3, atol=1e-3)
 
 
-def test_chunks_and_readings_change_no_bit(tmp_path, monkeypatch):
+def test_chunks_and_readings_change_no_bit(tmp_path, read_by):
     path = made.write_obj(tmp_path)
     source = open_mesh(path)
     first = [raw.points_world for raw in source.read_chunks()]
-    monkeypatch.setattr(mesh_module, "CHUNK", 777)
+    read_by(777)
     again = [raw.points_world for raw in source.read_chunks()]
     assert (len(first), len(again)) == (1, 13)
     np.testing.assert_array_equal(np.concatenate(again), first[0])

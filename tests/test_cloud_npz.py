@@ -8,7 +8,7 @@ from refusals import assert_refused
 from scans import read_cloud
 from test_cloud_morton import read, seeded_cloud
 
-from piccolo.cloud.readers import npz, reader as raw
+from piccolo.cloud.readers import npz
 from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import open_source
 from piccolo.scan_map.map_file import FORMAT, is_map_file, load_map
@@ -38,8 +38,8 @@ ARRAYS |= {"big-endian": WHOLE.astype(">f8"), "float32": WHOLE.astype("f4")}
 
 @pytest.mark.parametrize("kind", ARRAYS)
 @pytest.mark.parametrize("chunk", [7, 1200, 1 << 20])
-def test_single_arrays(tmp_path, monkeypatch, kind, chunk):
-    monkeypatch.setattr(raw, "CHUNK", chunk)
+def test_single_arrays(tmp_path, read_by, kind, chunk):
+    read_by(chunk)
     array = ARRAYS[kind]
     assert_read_as_written(save(tmp_path / "a.npy", array), array[:, :3])
     shutil.copy(tmp_path / "a.npy", tmp_path / "scan.txt")
@@ -51,8 +51,8 @@ def test_single_arrays(tmp_path, monkeypatch, kind, chunk):
 @pytest.mark.parametrize("saver", SAVERS)
 @pytest.mark.parametrize("names", [("points", "colors"), ("xyz", "rgb"), ("points", "rgb")])
 @pytest.mark.parametrize(("kind", "top"), [("u1", 255), ("<u2", 65535), (">u2", 65535), ("f4", 1), ("f8", 1)])
-def test_pairs_of_arrays(tmp_path, monkeypatch, saver, names, kind, top):
-    monkeypatch.setattr(raw, "CHUNK", 500)
+def test_pairs_of_arrays(tmp_path, read_by, saver, names, kind, top):
+    read_by(500)
     colors = (RGB * (top / 255.0)).astype(kind)
     path = tmp_path / "a.npz"
     saver(path, other=np.arange(5), **{names[1]: colors, names[0]: np.asfortranarray(XYZ.astype("f4"))})

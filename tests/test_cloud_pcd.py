@@ -7,7 +7,7 @@ from refusals import assert_refused
 from scans import read_cloud
 from test_cloud_morton import read, seeded_cloud
 
-from piccolo.cloud.readers import reader as raw, text
+from piccolo.cloud.readers import reader as raw
 from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import open_source
 from piccolo.errors import InputError
@@ -81,9 +81,9 @@ COLORS = {
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("kind", COLORS)
-def test_encodings_and_colors(tmp_path, encoding, kind, monkeypatch):
+def test_encodings_and_colors(tmp_path, encoding, kind, read_by):
     assert_read_as_written(write(tmp_path / "a.pcd", COLORS[kind], encoding))
-    monkeypatch.setattr(raw, "CHUNK", 500)
+    read_by(500)
     chunks = list(open_source(tmp_path / "a.pcd").read_chunks())
     assert [len(chunk.colors) for chunk in chunks] == [500, 500, 200]
     assert_read_as_written(tmp_path / "a.pcd")
@@ -200,9 +200,8 @@ def test_what_packs_best_is_read_and_broken_data_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_a_file_cut_while_it_is_read_is_refused(tmp_path, monkeypatch, encoding):
-    monkeypatch.setattr(raw, "CHUNK", 50)
-    monkeypatch.setattr(text, "BLOCK", 2048)
+def test_a_file_cut_while_it_is_read_is_refused(tmp_path, read_by, encoding):
+    read_by(50, 2048)
     path = write(tmp_path / "a.pcd", COLORS["r g b"], encoding)
     source = open_source(path)
     chunks = source.read_chunks()

@@ -7,7 +7,7 @@ from scans import read_cloud
 from test_cloud_morton import read, seeded_cloud
 from test_cloud_text import write
 
-from piccolo.cloud.readers import reader as raw, text
+from piccolo.cloud.readers import text
 from piccolo.cloud.readers.text import line_blocks, open_ptx, open_text
 from piccolo.cloud.stream import open_source
 from piccolo.errors import InputError
@@ -88,10 +88,10 @@ def test_large_coordinates_keep_their_digits_without_points_that_did_not_return(
 
 
 @pytest.mark.parametrize("chunk", [1, 3, 499, 500, 501])
-def test_chunk_size_changes_nothing(tmp_path, monkeypatch, chunk):
+def test_chunk_size_changes_nothing(tmp_path, read_by, chunk):
     path = write(tmp_path / "a.ptx", TWO_SCANS)
     whole = read(path)
-    monkeypatch.setattr(raw, "CHUNK", chunk)
+    read_by(chunk)
     assert max(len(part.colors) for part in open_source(path).read_chunks()) == chunk
     for a, b in zip(whole, read(path), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -129,8 +129,8 @@ def test_a_line_that_may_be_cut_off_is_not_read_and_infinite_points_are(tmp_path
         (1210, "1 2 3 4 5 6 7\n1 2 3 4 5 6 7", r"line 1211 is '1 2 3 4 5 6 7', wanted a count"),
     ],
 )
-def test_broken_lines_are_named(tmp_path, monkeypatch, number, line, message):
-    monkeypatch.setattr(raw, "CHUNK", 64)
+def test_broken_lines_are_named(tmp_path, read_by, number, line, message):
+    read_by(64)
     lines = [*scan(RAW.points_world, RAW.colors), *scan(RAW.points_world[:5], RAW.colors[:5])]
     lines[number - 1 : number] = [] if line is None else [line]
     path = write(tmp_path / "a.ptx", lines)
@@ -152,8 +152,8 @@ def test_further_columns_of_pts_are_passed_over(tmp_path):
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 400, 1 << 20])
-def test_counts_stand_between_scans_of_pts(tmp_path, monkeypatch, chunk):
-    monkeypatch.setattr(raw, "CHUNK", chunk)
+def test_counts_stand_between_scans_of_pts(tmp_path, read_by, chunk):
+    read_by(chunk)
     lines = pts()
     lines = ["", "400", *lines[:400], "0", "800", *lines[400:], "", "0"]
     assert_read_as_written(write(tmp_path / "a.pts", lines))
@@ -190,10 +190,9 @@ def test_empty_files_and_scans_that_have_gone_between_two_readings_are_refused(t
 
 @pytest.mark.parametrize("name", ["a.ptx", "a.pts"])
 @pytest.mark.parametrize("gray", [False, True])
-def test_a_file_cut_while_it_is_read_is_refused(tmp_path, monkeypatch, name, gray):
+def test_a_file_cut_while_it_is_read_is_refused(tmp_path, read_by, name, gray):
     """At a line's end, where no line is broken, and by all that had not been read yet."""
-    monkeypatch.setattr(raw, "CHUNK", 50)
-    monkeypatch.setattr(text, "BLOCK", 4096)
+    read_by(50, 4096)
     lines = TWO_SCANS if name == "a.ptx" else ["1200", *pts()]
     if gray:
         fields = [line.split() for line in lines]

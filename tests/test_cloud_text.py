@@ -7,7 +7,6 @@ from scans import read_cloud
 from test_cloud_morton import read, seeded_cloud, whole
 from test_cloud_ply import vertices, write as write_ply
 
-from piccolo.cloud.readers import reader, text
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.readers.text import is_number, open_text
 from piccolo.cloud.settings import IN_COLORS
@@ -121,9 +120,8 @@ def test_other_content_is_refused(tmp_path, content, message):
 
 
 @pytest.fixture
-def small(monkeypatch):
-    monkeypatch.setattr(text, "BLOCK", 101)
-    monkeypatch.setattr(reader, "CHUNK", 13)
+def small(read_by):
+    read_by(13, 101)
 
 
 @given(field=st.text("0123456789.+-eEinfatyNAx_j\xa0", max_size=6).filter(str.strip))

@@ -1,20 +1,22 @@
 """Poses compared by blocks: an occluder costs what it hides, and what is not shown costs nothing."""
 
 import functools
+from dataclasses import replace
 
 import naive
 import numpy as np
 import pytest
 import rooms
+from made_up import make_candidate
 
-from piccolo.confidence.alternatives import Hypothesis
 from piccolo.evidence import comparison
-from piccolo.evidence.verification import count_agreeing
-from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
-from piccolo.geometry.sphere import find_cell, pixel_rays, solid_angles
-from piccolo.judge import decide as judging
-from piccolo.judge.decide import is_mirrored
-from piccolo.optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
+from piccolo.evidence.examine import count_agreeing, examine
+from piccolo.geometry.pose import Pose, exp_so3, uniform_yaws, yaw_rotation
+from piccolo.geometry.sphere import BLOCK_RINGS, find_cell, pixel_rays, solid_angles
+from piccolo.judge.candidate import CONTRADICTS, Comparison
+from piccolo.judge.selection import is_mirrored
+from piccolo.localization.mirror import find_mirrored, is_found_again, list_mirrored
+from piccolo.optimize.channel_loss import CHANCE, NUM_BLOCKS
 from piccolo.panorama import Panorama
 from piccolo.panorama.texels import pack_texels
 from research.synthetic.world import mask_outside_field, occlude
@@ -24,7 +26,7 @@ TILTED = exp_so3(np.array([0.4, -1.1, 0.7]))
 AREAS = solid_angles(WIDTH)[:, None] / (4 * np.pi) * np.ones(WIDTH)
 
 
-def _query(rgb, is_hidden=None):
+def _problem(rgb, is_hidden=None):
     is_valid = np.ones(rgb.shape[:2], bool) if is_hidden is None else ~is_hidden
     return rooms.ask(Panorama(rgb, is_valid), rooms.scan_map(1))
 
@@ -32,7 +34,7 @@ def _query(rgb, is_hidden=None):
 @functools.lru_cache
 def _clean():
     true_pose = rooms.scene(1)[2]
-    return comparison.compare(_query(rooms.query(1).rgb), true_pose), true_pose
+    return comparison.compare(_problem(rooms.query(1).rgb), true_pose), true_pose
 
 
 @functools.lru_cache
@@ -87,14 +89,14 @@ def test_score_and_ratio_by_hand():
     """Blocks below chance give nothing; only what both poses show is compared."""
     half = CHANCE + 0.5 * (1 - CHANCE)
     area = np.array([0.2, 0.1, 0.1])
-    a = comparison.Comparison(np.array([half, 0.1, -0.9]), area, area, 0.5)
+    a = Comparison(np.array([half, 0.1, -0.9]), area, area, 0.5)
     assert a.score == pytest.approx(0.5 * 0.2 / 0.5)
-    b = comparison.Comparison(np.array([1.0, 1.0, half]), area, np.array([0.1, 0.0, 0.1]), 0.5)
+    b = Comparison(np.array([1.0, 1.0, half]), area, np.array([0.1, 0.0, 0.1]), 0.5)
     assert a.compute_ratio(b) == pytest.approx((0.5 * 0.1) / (1.0 * 0.1 + 0.5 * 0.1))
     assert b.compute_ratio(a) == pytest.approx(1 / a.compute_ratio(b))
     assert a.compute_ratio(a) == 1.0
-    elsewhere = comparison.Comparison(np.ones(3), area, np.array([0.01, 0.0, 0.3]), 0.5)
-    other = comparison.Comparison(np.ones(3), area, np.array([0.3, 0.0, 0.02]), 0.5)
+    elsewhere = Comparison(np.ones(3), area, np.array([0.01, 0.0, 0.3]), 0.5)
+    other = Comparison(np.ones(3), area, np.array([0.3, 0.0, 0.02]), 0.5)
     assert elsewhere.compute_ratio(other) == 0.0
 
 
@@ -103,11 +105,11 @@ def test_the_true_pose_explains_more_than_others():
     assert 0.6 < seen.score < 1.0
     assert seen.compute_ratio(seen) == 1.0
     assert seen.valid_area == pytest.approx(1.0, abs=1e-3)
-    query = _query(rooms.query(1).rgb)
+    problem = _problem(rooms.query(1).rgb)
     R = yaw_rotation(1.0) @ true_pose.R_cam_from_world
-    turned = comparison.compare(query, Pose(R, true_pose.center_world))
+    turned = comparison.compare(problem, Pose(R, true_pose.center_world))
     beside = true_pose.center_world + np.array([0.3, 0.0, 0.0])
-    moved = comparison.compare(query, Pose(true_pose.R_cam_from_world, beside))
+    moved = comparison.compare(problem, Pose(true_pose.R_cam_from_world, beside))
     for wrong in (turned, moved):
         assert wrong.score < 0.5 * seen.score
         assert wrong.compute_ratio(seen) < 0.5
@@ -117,20 +119,20 @@ def test_what_is_seen_from_a_pose_near_is_placed_as_it_is():
     """A view of 2 cm beside is compared from the pose itself: no shift; it is not rendered again."""
     seen, true_pose = _clean()
     beside = Pose(true_pose.R_cam_from_world, true_pose.center_world + np.array([0.015, -0.012, 0.0]))
-    query = _query(rooms.query(1).rgb)
-    query.view_at(beside, "fine")
-    found = comparison.compare_from(query, true_pose, beside)
-    assert query.cache.views.averages.cache_info().misses == 1
+    problem = _problem(rooms.query(1).rgb)
+    problem.view_at(beside, "fine")
+    found = comparison.compare_from(problem, true_pose, beside)
+    assert problem.views.averages.cache_info().misses == 1
     assert found.score == pytest.approx(seen.score, abs=0.02)
     assert found.score != seen.score
-    assert comparison.compare(query, true_pose).score == seen.score  # whoever asked before
+    assert comparison.compare(problem, true_pose).score == seen.score  # whoever asked before
 
 
 @pytest.mark.parametrize("fraction", [0.2, 0.5])
 def test_an_occluder_costs_what_it_hides(fraction):
     seen, true_pose = _clean()
     rgb, is_hidden = _hidden(fraction)
-    behind = comparison.compare(_query(rgb), true_pose)
+    behind = comparison.compare(_problem(rgb), true_pose)
     touched = _blocks_of(is_hidden)
     lost = ((touched > 0.02) * seen.area * np.maximum(seen.correlation - CHANCE, 0) / (1 - CHANCE)).sum()
     assert behind.score >= seen.score - lost - 0.02
@@ -144,7 +146,7 @@ def test_an_occluder_costs_what_it_hides(fraction):
 def test_blocks_outside_a_narrow_photo_count_nothing():
     seen, true_pose = _clean()
     outside = mask_outside_field(WIDTH, 90.0, 0.5)
-    narrow = comparison.compare(_query(rooms.query(1).rgb, outside), true_pose)
+    narrow = comparison.compare(_problem(rooms.query(1).rgb, outside), true_pose)
     shown = _blocks_of(~outside)
     assert (narrow.visible_area[shown == 0.0] == 0.0).all()
     assert (narrow.area[shown == 0.0] == 0.0).all()
@@ -152,29 +154,36 @@ def test_blocks_outside_a_narrow_photo_count_nothing():
     assert narrow.visible_area.sum() <= narrow.valid_area + 0.01
     assert narrow.score > 0.7 * seen.score
     black = np.where(outside[..., None], 0, rooms.query(1).rgb).astype(np.uint8)
-    again = comparison.compare(_query(black, outside), true_pose)
+    again = comparison.compare(_problem(black, outside), true_pose)
     np.testing.assert_array_equal(again.correlation, narrow.correlation)
 
 
 def test_what_contradicts_is_masked_and_the_rest_stays():
     true_pose = rooms.scene(1)[2]
     rgb, is_hidden = _hidden(0.4)
-    query = _query(rgb)
-    shown = comparison.mask_occluders(query, comparison.compare(query, true_pose))
+    problem = _problem(rgb)
+    seen = comparison.compare(problem, true_pose)
+    unoccluded = comparison.mask_occluders(problem, seen)
+    shown = problem.show(unoccluded.photo)
     masked = _blocks_of(~shown.photo.panorama.is_valid[::2, ::2])
     covered = _blocks_of(is_hidden)
     assert masked[covered > 0.9].mean() > 0.8
     assert masked[covered == 0.0].mean() < 0.15
-    assert shown.settings is query.settings
-    assert query.photo.panorama.is_valid.all()  # as it was
+    assert comparison.mask_occluders(problem, seen, unoccluded) is unoccluded
+    assert problem.photo.panorama.is_valid.all()  # as it was
     after = comparison.compare(shown, true_pose)
-    seen = comparison.compare(query, true_pose)
     assert after.score > seen.score
     left = 1.0 - (AREAS * ~shown.photo.panorama.is_valid[::2, ::2]).sum()
     assert after.valid_area == pytest.approx(left, abs=0.02)
-    clean = _query(rooms.query(1).rgb)
-    fits = (comparison.compare(clean, true_pose).correlation >= comparison.CONTRADICTS).all()
-    assert (comparison.mask_occluders(clean, comparison.compare(clean, true_pose)) is clean) == fits
+    clean = _problem(rooms.query(1).rgb)
+    seen = comparison.compare(clean, true_pose)
+    fits = (seen.correlation >= CONTRADICTS).all()
+    assert (comparison.mask_occluders(clean, seen).photo is clean.photo) == fits
+
+
+def _is_turned_over(problem, best):
+    mirrored = find_mirrored(problem, best, rooms.AUTO.effort, rooms.WORKERS)
+    return is_mirrored(count_agreeing(problem, best, rooms.WORKERS), mirrored)
 
 
 @pytest.mark.parametrize(("fov_deg", "asks_map"), [(None, True), (None, False), (90.0, True)])
@@ -182,40 +191,40 @@ def test_a_photo_that_was_turned_over_is_told(fov_deg, asks_map):
     """Whole or narrow: whole views explain nearly all of the mirrored photo where it is found."""
     outside = None if fov_deg is None else mask_outside_field(WIDTH, fov_deg, 0.5)
     rgb = rooms.query(1).rgb
-    right = _query(rgb, outside)
-    turned_over = _query(rgb[:, ::-1].copy(), None if outside is None else outside[:, ::-1].copy())
+    right = _problem(rgb, outside)
+    turned_over = _problem(rgb[:, ::-1].copy(), None if outside is None else outside[:, ::-1].copy())
     if not asks_map:
         right, turned_over = (one.without_features() for one in (right, turned_over))
     assert right.photo.is_partial == turned_over.photo.is_partial == (fov_deg is not None)
-    doubtful = Hypothesis(_clean()[1], 0.69)
-    assert count_agreeing(right, doubtful.pose) > 15
-    plain = Hypothesis(doubtful.pose, 0.7)  # it explains nearly all of the photo
-    assert is_mirrored(turned_over, doubtful)
-    assert not is_mirrored(right, doubtful)
-    assert comparison.score_pose(right, doubtful.pose).score > 0.9
-    assert comparison.score_pose(turned_over, doubtful.pose).score < 0.05
-    assert not is_mirrored(turned_over, plain)
-    assert not is_mirrored(turned_over.by_views(), doubtful)
+    found = examine(right, _clean()[1])
+    assert found.score > 0.9
+    assert examine(turned_over, found.pose).score < 0.05
+    doubtful = replace(found, score=0.69)
+    assert count_agreeing(right, doubtful, rooms.WORKERS).num_matches > 15
+    assert _is_turned_over(turned_over, doubtful)
+    assert not _is_turned_over(right, doubtful)
+    plain = replace(found, score=0.7)  # it explains nearly all of the photo
+    for problem, best in ((turned_over, plain), (turned_over.by_views(), doubtful)):
+        assert find_mirrored(problem, best, rooms.AUTO.effort, rooms.WORKERS) is None
 
 
-@pytest.mark.parametrize(("score", "expected"), [(0.49, False), (0.52, False), (0.53, True)])
-def test_a_photo_that_views_explain_as_well_is_not_mirrored_by_its_matches(monkeypatch, score, expected):
+@pytest.mark.parametrize(
+    ("score", "num_matches", "expected"),
+    [(0.49, 30, False), (0.52, 30, False), (0.53, 30, True), (0.53, 20, False)],
+)
+def test_a_photo_that_views_explain_as_well_is_not_mirrored_by_its_matches(score, num_matches, expected):
     """The mirrored photo has more matches, as in a place that looks alike in a mirror."""
-    turned_over = _query(rooms.query(1).rgb[:, ::-1].copy())
-    monkeypatch.setattr(judging, "refine_matches", lambda query, poses: [Hypothesis(poses[0], score)])
-    assert is_mirrored(turned_over, Hypothesis(_clean()[1], 0.5)) == expected
+    own = make_candidate(0.0, 0.5, 20)
+    assert is_mirrored(own, make_candidate(0.0, score, num_matches)) == expected
+    assert not is_mirrored(own, None)
 
 
-@pytest.mark.parametrize(("score", "is_brief"), [(0.37, True), (0.35, False)])
-def test_the_mirrored_photo_is_searched_as_thoroughly_as_its_own_pose_needs(monkeypatch, score, is_brief):
-    """Briefly, if a brief search finds nine tenths of the score at the photo's own pose."""
-    query = _query(rooms.query(1).rgb[:, ::-1].copy()).without_features()
-    asked = []
-    monkeypatch.setattr(judging, "score_near", lambda *_: 0.4)
-    monkeypatch.setattr(judging, "score_briefly", lambda _: score)
-    monkeypatch.setattr(judging, "refine_starts", lambda by, starts, beam: asked.append((by, beam)) or [])
-    judging.search_mirrored(query, query.mirror(), _clean()[1])
-    ((by, beam),) = asked
-    assert (by.settings.max_starts < query.settings.max_starts) == is_brief
-    assert (beam != query.beam) == is_brief
-    assert len(by.rotations) == 2 * query.settings.num_yaws
+def test_the_mirrored_photo_is_searched_as_thoroughly_as_its_own_pose_needs():
+    """Briefly, if a brief search finds nine tenths of the score at the photo's own pose; also upside down."""
+    assert is_found_again(0.37, 0.4)
+    assert not is_found_again(0.35, 0.4)
+    rotations = list_mirrored(TILTED, 12)
+    upright = np.array([1.0, -1.0, 1.0])[:, None] * TILTED * [1.0, -1.0, 1.0] @ uniform_yaws(12)
+    np.testing.assert_allclose(rotations[:12], upright, atol=1e-12)
+    for half, sign in ((rotations[:12], 1.0), (rotations[12:], -1.0)):
+        np.testing.assert_allclose(half[:, :, 2], np.tile(sign * upright[0, :, 2], (12, 1)), atol=1e-12)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import rooms
 from made_up import at
+from piccolo.localization.settings import CoarseToFineSettings
 from rooms import as_panorama
 
 from piccolo.confidence import alternatives, confidence as rule
@@ -14,7 +15,6 @@ from piccolo.errors import InputError
 from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose import exp_so3, step
 from piccolo.judge.belief import make_belief
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.paper.localize import PaperSettings
 
 SURE = 0.002  # [m] largest deviation

@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rooms
-from piccolo.localization.query import prepare_query
 
 from piccolo.cloud import layers
 from piccolo.cloud.octree import build_octree
 from piccolo.evidence import covariance
-from piccolo.evidence.comparison import compare
+from piccolo.evidence.examine import examine
 from piccolo.geometry.pose import exp_so3
 from piccolo.jobs.threads import Workers
 from piccolo.scan_map.scan_map import prepare_map
@@ -152,11 +151,12 @@ def test_layers_are_an_error_that_photos_have_in_common():
     prepared = rooms.scan_map(1)
     assert not prepared.layers.any()
     pose = prepared.from_world(query.pose)
-    asked = prepare_query(rooms.as_panorama(query.rgb), prepared, rooms.KNOWN, WORKERS)
-    single = covariance.estimate_covariance(asked, pose, compare(asked, pose))
+    asked = rooms.ask(rooms.as_panorama(query.rgb), prepared, rooms.KNOWN)
+    candidate = examine(asked, pose)
+    single = covariance.estimate_covariance(asked, candidate, WORKERS)
     motion = np.stack([pose.center_world, [0.0, 0.0, 0.0], [0.06, 0.0, 0.0]])
     double = replace(asked, scan_map=replace(prepared, layers=motion))
-    found = covariance.estimate_covariance(double, pose, compare(double, pose))
+    found = covariance.estimate_covariance(double, candidate, WORKERS)
     added = found.gaussian.common - single.gaussian.common
     np.testing.assert_allclose(added[3:, 3:], np.eye(3) * 0.06**2 / 12.0, atol=1e-12)
     assert np.array_equal(found.gaussian.own, single.gaussian.own)

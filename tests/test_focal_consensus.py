@@ -20,8 +20,8 @@ from piccolo.confidence.localization import FocalLength, Localization
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
+from piccolo.judge.conclude import follow_consensus
 from piccolo.judge.reasons import Reason
-from piccolo.localization.judge import follow_consensus
 from piccolo.result import Result, Source, read_results
 from research.synthetic.world import render_picture
 

@@ -14,16 +14,18 @@ from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.camera.resampling import View, make_sphere
 from piccolo.confidence.localization import Alternative, Evidence, FocalLength, Localization
+from piccolo.evidence import focal_length as focal
+from piccolo.evidence.examine import examine
+from piccolo.evidence.lens_matches import fit_matches
+from piccolo.evidence.self_calibration import Estimate
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.judge.belief import make_belief
+from piccolo.judge.candidate import Selection
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import bundle, focal_length as focal, localize as module
-from piccolo.localization.comparison import score_pose
-from piccolo.localization.lens_matches import MatchFit, fit_matches
+from piccolo.localization import localize as module
+from piccolo.localization.calibration import follow_matches, recalibrate
 from piccolo.localization.localize import select_likeliest
-from piccolo.localization.selection import Selection
-from piccolo.localization.self_calibration import Estimate
 from piccolo.panorama import read_panorama
 from piccolo.photo import Photo
 from research.synthetic.world import render_picture
@@ -44,8 +46,9 @@ def _panorama(rgb, **options):
 
 def _fit(rgb, pose, **options):
     panorama = _panorama(rgb, **options)
-    query = rooms.ask(panorama, rooms.scan_map(SEED))
-    return panorama, focal.fit_focal(query, scan().from_world(pose))
+    problem = rooms.ask(panorama, rooms.scan_map(SEED))
+    candidate = examine(problem, scan().from_world(pose))
+    return panorama, focal.fit_focal(problem, candidate, rooms.WORKERS)
 
 
 def test_the_picture_tells_the_focal_length_within_its_deviation():
@@ -63,10 +66,11 @@ def test_the_picture_tells_the_focal_length_within_its_deviation():
 def test_matches_with_photos_beside_follow_the_focal_length():
     """A ray goes to the same pixel of the picture, by the new focal length."""
     panorama = _panorama(_photo(pinhole(320, 240, TRUE))[0], focal_px=TRUE)
-    query = rooms.ask(panorama, rooms.scan_map(SEED))
+    problem = rooms.ask(panorama, rooms.scan_map(SEED))
     rays = np.float32([[1.0, 0.0, 0.0], [0.8, 0.6, 0.0]])
     beside = NO_MATCHES._replace(rays=rays)
-    (turned,) = focal.recalibrate(replace(query, beside=(beside,)), np.array([0.02])).beside
+    asked = replace(problem, beside=(beside,))
+    (turned,) = recalibrate(asked, np.array([0.02]), rooms.WORKERS).beside
     np.testing.assert_allclose(turned.rays[0], rays[0], atol=1e-6)
     slope = turned.rays[1, 1] / turned.rays[1, 0]
     assert slope == pytest.approx(0.75 * math.exp(-0.02), abs=1e-4)
@@ -105,14 +109,10 @@ def test_a_photo_with_a_guessed_focal_length_is_localized_and_says_what_it_found
     assert piccolo.Result.from_json(result.to_json()).focal_length == found
 
 
-def test_a_focal_length_that_contradicts_what_was_given_makes_no_sure_pose(monkeypatch):
-    """Nor does a bundle of one photo, which keeps what that rules out; the photo is searched for once."""
+def test_a_focal_length_that_contradicts_what_was_given_makes_no_sure_pose():
+    """Nor does a bundle of one photo, which keeps what that rules out."""
     rgb, pose = _photo(pinhole(320, 240, TRUE))
     photo = Photo(rgb, focal_px=145.0)
-    find = module.find
-    found = []
-    monkeypatch.setattr(module, "find", lambda *given: found.append(find(*given)) or found[0])
-    monkeypatch.setattr(bundle, "find", lambda *_: found[0])
     dense = rooms.scan(SEED, num_points=DENSE)
     alone = dense.localize(photo, gravity="known")
     (together,) = dense.localize_bundle([photo], [pose], gravity="known")
@@ -134,35 +134,32 @@ def test_each_source_of_a_focal_length_has_its_deviation():
 @pytest.mark.parametrize(
     ("minimum", "share", "std"), [(0.01, 0.5, 0.0071), (0.03, 0.88, 0.0096), (0.065, 0.97, 0.0101)]
 )
-def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(monkeypatch, minimum, share, std):
+def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(minimum, share, std):
     """Beyond two deviations the picture says where to look next."""
-    rgb, pose = _photo(pinhole(320, 240, TRUE))
-    query = rooms.ask(_panorama(rgb, focal_px=TRUE), rooms.scan_map(SEED))
+    panorama = _panorama(_photo(pinhole(320, 240, TRUE))[0], focal_px=TRUE)
+    camera = panorama.cameras[0].camera
     information = np.diag([1.0 / 0.01**2, 0.0, 0.0, 0.0, 0.0])
     found = Estimate(np.array([minimum, 0.0, 0.0, 0.0, 0.0]), information, np.ones((6, 5)))
-    monkeypatch.setattr(focal, "descend_lens", lambda *args: (None, None))
-    monkeypatch.setattr(focal, "estimate_lens", lambda *args: found)
-    monkeypatch.setattr(focal, "fit_matches", lambda query, pose, _: MatchFit(np.zeros(5), 0.0, pose))
-    fit = focal.fit_focal(query, scan().from_world(pose))
+    fit = focal.weigh_claim(panorama.focal_prior, camera, found, found)
     assert fit.conflict == pytest.approx(minimum / 0.01 / math.sqrt(2.0), rel=0.02)
     assert fit.change[0] / minimum == pytest.approx(share, abs=0.02)
     assert fit.deviation == pytest.approx(std, rel=0.03)
     nothing = found._replace(information=np.zeros((5, 5)))
-    monkeypatch.setattr(focal, "estimate_lens", lambda *args: nothing)
-    open_fit = focal.fit_focal(query, scan().from_world(pose))
+    open_fit = focal.weigh_claim(panorama.focal_prior, camera, nothing, nothing)
     assert (open_fit.change[0], open_fit.deviation, open_fit.conflict) == (0.0, pytest.approx(0.01), 0.0)
 
 
 def test_matches_lead_to_a_focal_length_that_is_far_off():
     rgb, pose = _photo(pinhole(320, 240, TRUE))
-    query = rooms.ask(_panorama(rgb, focal_px=0.8 * TRUE), rooms.scan_map(SEED))
-    found = Selection(score_pose(query, scan().from_world(pose)), ())
-    query, found = focal.follow_matches(query, found)
-    assert query.given.cameras[0].camera.focal[0] == pytest.approx(TRUE, rel=0.05)
+    problem = rooms.ask(_panorama(rgb, focal_px=0.8 * TRUE), rooms.scan_map(SEED))
+    found = Selection(examine(problem, scan().from_world(pose)), ())
+    problem, found = follow_matches(problem, found, rooms.WORKERS)
+    assert problem.given.cameras[0].camera.focal[0] == pytest.approx(TRUE, rel=0.05)
     assert found.best.pose.distance(scan().from_world(pose)) < 0.15
-    by_matches = fit_matches(query, found.best.pose, focal.FOCAL_WIDTHS)
+    matches = focal.list_matches(problem, found.best, rooms.WORKERS)
+    by_matches = fit_matches(problem.given.cameras[0], found.best.pose, matches, focal.FOCAL_WIDTHS)
     assert abs(by_matches.values[0]) < 2.5 / math.sqrt(by_matches.information)
-    assert focal.follow_matches(query, found) == (query, found)
+    assert follow_matches(problem, found, rooms.WORKERS) == (problem, found)
 
 
 def test_other_poses_with_other_guesses_share_the_probability():

@@ -7,53 +7,38 @@ import naive
 import numpy as np
 import pytest
 import rooms
+from made_up import exact_matches
 
+from piccolo.evidence.contradictions import contradictions
 from piccolo.geometry.pose import Pose, exp_so3
-from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.jobs.threads import Workers
 from piccolo.judge.reasons import explain
 from piccolo.local_features.feature_map import make_feature_map
 from piccolo.local_features.hypotheses import count_matches, exact_pose, propose_poses, rough_poses
-from piccolo.local_features.matching import Matches
-from piccolo.localization.attempts import match_poses
+from piccolo.localization.attempts import join_features, match_poses
 from piccolo.photo import Prior
-from piccolo.problem.prior import contradictions
 from piccolo.problem.settings import CoarseToFineSettings
 
 
 @functools.lru_cache
-def _query(seed, variant="clean"):
+def _problem(seed, variant="clean"):
     panorama = rooms.as_panorama(rooms.query(seed, variant).rgb)
     return rooms.ask(panorama, rooms.scan_map(seed))
+
+
+def _matches(problem):
+    return join_features(problem, rooms.WORKERS)[1]
 
 
 def _true_pose(seed, variant="clean"):
     return rooms.scan_map(seed).from_world(rooms.query(seed, variant).pose)
 
 
-def _exact_matches(pose, count, num_wrong=0, seed=0):
-    """Matches that a camera at the pose would have, seen from right there; the last ones of any points."""
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(-3, 3, (count, 3))
-    directions = points - pose.center_world
-    ranges = np.linalg.norm(directions, axis=1)
-    directions /= ranges[:, None]
-    tangents = np.cross(directions, rng.normal(size=(count, 3)))
-    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    angles = rng.uniform(0.02, 0.2, count)
-    rays, ray_tangents = directions @ pose.R_cam_from_world.T, tangents @ pose.R_cam_from_world.T
-    wrong = slice(count - num_wrong, count)
-    points[wrong] = rng.uniform(-3, 3, (num_wrong, 3))
-    values = rays, ray_tangents, angles, points, directions, tangents, angles * ranges
-    some = [np.asarray(a, np.float32) for a in values]
-    weights = rng.choice(np.float32([0.5, 1.0]), count)
-    return Matches(np.arange(count, dtype=np.int32), *some, weights)
-
-
 POSE = Pose(exp_so3(np.array([0.3, -0.8, 1.9])), np.array([0.4, -0.2, 0.3]))
 
 
 def test_one_exact_match_gives_the_pose_and_its_votes_equal_their_twin():
-    matches = _exact_matches(POSE, 40, num_wrong=10)
+    matches = exact_matches(POSE, 40, num_wrong=10)
     matches = matches._replace(query=np.repeat(np.arange(20, dtype=np.int32), 2))
     voters = np.arange(40)
     rotations, centers, votes = np.empty((40, 3, 3)), np.empty((40, 3)), np.empty(40)
@@ -66,7 +51,7 @@ def test_one_exact_match_gives_the_pose_and_its_votes_equal_their_twin():
 
 
 def test_the_pose_is_found_among_wrong_matches():
-    matches = _exact_matches(POSE, 60, num_wrong=40)
+    matches = exact_matches(POSE, 60, num_wrong=40)
     found = propose_poses(matches, 6, Workers())
     assert found[0].num_matches >= 20
     assert rooms.errors(found[0].pose, POSE)[0] < 1e-4
@@ -77,18 +62,18 @@ def test_the_pose_is_found_among_wrong_matches():
 
 
 def test_the_pose_of_too_few_matches_is_none():
-    assert exact_pose(_exact_matches(POSE, 30), POSE).num_matches == 30
-    assert exact_pose(_exact_matches(POSE, 3), POSE) is None
+    assert exact_pose(exact_matches(POSE, 30), POSE).num_matches == 30
+    assert exact_pose(exact_matches(POSE, 3), POSE) is None
 
 
 @pytest.mark.parametrize("variant", ["clean", "tilt", "photo"])
 def test_a_photo_is_found_in_its_room_with_the_same_bits_for_any_threads(variant):
-    query = _query(1, variant)
-    found = propose_poses(query.matches, 6, Workers(2))
+    matches = _matches(_problem(1, variant))
+    found = propose_poses(matches, 6, Workers(2))
     rooms.assert_near(found[0].pose, _true_pose(1, variant), 0.05, 1.0)
     assert found[0].num_matches >= 12
     assert [one.num_matches for one in found] == sorted((one.num_matches for one in found), reverse=True)
-    alone = propose_poses(query.matches, 6, Workers(1))
+    alone = propose_poses(matches, 6, Workers(1))
     for one, other in zip(found, alone, strict=True):
         assert one.pose.key == other.pose.key
         assert one.num_matches == other.num_matches
@@ -97,11 +82,10 @@ def test_a_photo_is_found_in_its_room_with_the_same_bits_for_any_threads(variant
 def test_noise_has_no_pose_that_many_matches_agree_with():
     rgb = np.random.default_rng(9).integers(0, 256, (256, 512, 3)).astype(np.uint8)
     panorama, scan_map = rooms.as_panorama(rgb), rooms.scan_map(1)
-    query = rooms.ask(panorama, scan_map)
-    found = propose_poses(query.matches, 6, Workers(2))
+    found = propose_poses(_matches(rooms.ask(panorama, scan_map)), 6, Workers(2))
     assert max([0, *(one.num_matches for one in found)]) < 8
     flat = rooms.ask(rooms.as_panorama(np.full_like(rgb, 90)), scan_map)
-    assert propose_poses(flat.matches, 6, Workers(2)) == []
+    assert propose_poses(_matches(flat), 6, Workers(2)) == []
 
 
 def test_poses_that_contradict_a_prior_are_told():
@@ -123,12 +107,10 @@ def test_poses_that_contradict_a_prior_are_told():
 
 
 def test_matches_beyond_a_prior_are_asked_too():
-    query, world = _query(1), rooms.query(1).pose
-    x, y, _ = world.center_world
+    x, y, _ = rooms.query(1).pose.center_world
     prior = Prior(near=(x + 1.4, y, None), radius=0.5)
-    poses = match_poses(
-        replace(query, settings=CoarseToFineSettings(gravity="known", prior=prior)), Stopwatch()
-    )
+    asked = replace(_problem(1), prior=prior, gravity="known")
+    poses, _ = match_poses(asked, rooms.means())
     assert any(rooms.errors(pose, _true_pose(1))[0] < 0.1 for pose in poses)
 
 

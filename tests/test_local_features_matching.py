@@ -12,6 +12,7 @@ from piccolo.jobs.threads import Workers
 from piccolo.local_features import feature_map
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import FAR, NUM_NEIGHBORS, match, nearest_lists, search_lists
+from piccolo.localization.attempts import join_features
 
 
 def _descriptors(rng, count):
@@ -129,24 +130,23 @@ def test_same_bits_for_any_number_of_threads_and_none_where_nothing_is():
 
 @pytest.fixture(scope="module")
 def matches():
-    query = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1))
-    return query.matches
+    return join_features(rooms.ask(rooms.scene(1)[1], rooms.scan_map(1)), rooms.WORKERS)[1]
 
 
 def test_matches_of_halves_are_those_of_the_whole_numbered_on():
-    query = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1))
-    halves = [half() for half in query.features]
-    joined, keypoints = query.matches, query.keypoints
+    problem = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1))
+    halves = [half(rooms.WORKERS) for half in problem.features]
+    keypoints, joined = join_features(problem, rooms.WORKERS)
     assert len(joined.query) == sum(len(half.matches.query) for half in halves)
     np.testing.assert_array_equal(keypoints.rays[joined.query], joined.rays)
     own = match(keypoints, rooms.scan_map(1).local_features, Workers(1))
     for values, others in zip(joined, own, strict=True):
         assert values.dtype == others.dtype
         np.testing.assert_array_equal(values, others)
-    half = dataclasses.replace(query, features=query.features[:1])
-    assert half.matches.query.tolist() == halves[0].matches.query.tolist()
-    none = query.by_views()
-    assert len(none.matches.query) == len(none.keypoints.rays) == 0
+    half = dataclasses.replace(problem, features=problem.features[:1])
+    assert join_features(half, rooms.WORKERS)[1].query.tolist() == halves[0].matches.query.tolist()
+    keypoints, none = join_features(problem.by_views(), rooms.WORKERS)
+    assert len(none.query) == len(keypoints.rays) == 0
 
 
 def test_matches_come_in_the_photos_order_the_distinct_ones_weigh_most(matches):

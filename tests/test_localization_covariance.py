@@ -1,24 +1,26 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 import pytest
 import rooms
-from rooms import as_panorama, errors, query
+from made_up import PARTIAL, WHOLE
+from rooms import WORKERS, as_panorama, errors, query
 
 from piccolo.cloud.readers.reader import PointSource, RawCloud
 from piccolo.cloud.stream import CloudStream
 from piccolo.confidence.covariance import describe_errors
 from piccolo.evidence import covariance
-from piccolo.evidence.comparison import compare, score_pose
-from piccolo.evidence.sphere import calibrate_sphere
+from piccolo.evidence.examine import examine
 from piccolo.geometry.pose import Pose, exp_so3, step, yaw_rotation
 from piccolo.geometry.sphere import compute_pixels, pixel_rays
 from piccolo.jobs.threads import Workers
-from piccolo.judge.selection import Selection
+from piccolo.judge.candidate import Selection, Unoccluded
+from piccolo.localization.calibration import calibrate_sphere
 from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map
@@ -112,8 +114,9 @@ def test_covariance_is_in_the_worlds_axes(found):
     prepared, pose, result = found
     R = exp_so3(np.array([0.2, -0.5, 1.1]))
     own = result.covariance.matrix
-    told = covariance.estimate_covariance(prepared, pose, compare(prepared, pose))
-    fit = calibrate_sphere(prepared, Selection(score_pose(prepared, pose), ()))[2]
+    candidate = examine(prepared, pose)
+    told = covariance.estimate_covariance(prepared, candidate, WORKERS)
+    fit = calibrate_sphere(prepared, Selection(candidate, ()), WORKERS)[2]
     other = describe_errors(told.widen(fit.pose_covariance).gaussian, R.T).matrix
     np.testing.assert_allclose(other[:3, :3], own[:3, :3], rtol=1e-6)
     np.testing.assert_allclose(R @ other[3:, 3:] @ R.T, own[3:, 3:], rtol=1e-6, atol=1e-12)
@@ -123,47 +126,44 @@ def test_in_a_place_ten_times_as_large_a_position_is_known_a_tenth_as_well(found
     prepared, pose, _ = found
     points = _points(prepared, pose)
     places = [points._replace(offsets=points.offsets * np.float32(size)) for size in (4.0, 40.0)]
-    small, large = (covariance.compute_covariance(prepared, place, pose, False) for place in places)
+    small, large = (
+        covariance.compute_covariance(prepared.photo, place, pose, WHOLE, WORKERS) for place in places
+    )
     per_metre = np.repeat([1.0, 0.1], 3)
     np.testing.assert_allclose(large * np.outer(per_metre, per_metre), small, rtol=0.02, atol=1e-9)
 
 
-@pytest.mark.parametrize("num_rough", [1, 2, 3])
-def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monkeypatch, num_rough):
-    prepared, pose, _ = found
-    texels, asked = [image().rgbx for image in prepared.photo.images], []
-    ways = list(zip(texels[:3], (*covariance.STEPS, covariance.ROUGH_STEPS), strict=True))
+@pytest.mark.parametrize("num_rough", [0, 1, 2, 3])
+def test_where_the_finest_images_have_no_minimum_the_next_one_tells(num_rough):
+    """Those that have one count alike."""
+    ways = (*covariance.STEPS, covariance.ROUGH_STEPS)
+    assert [steps.image for steps in ways] == ["full", "fine", "middle"]
+    told = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    asked = []
 
-    def hessian(problem, pose, turn, median_range):
-        steps = next(steps for texels, steps in ways if texels is problem.texels)
-        assert turn == steps.turn
-        asked.append((problem.texels, steps))
-        return np.diag([1.0] * 5 + [-1.0 if any(problem.texels is t for t, _ in ways[:num_rough]) else 1.0])
+    def by(steps):
+        asked.append(steps)
+        return None if steps in ways[:num_rough] else steps.inflation * told
 
-    gradients = np.random.default_rng(0).normal(size=(100, 6))
-    monkeypatch.setattr(covariance, "compute_hessian", hessian)
-    monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
-    matrix = covariance.compute_covariance(prepared, _points(prepared, pose), pose, False)
-    assert (
-        sorted(asked, key=lambda each: ("full", "fine", "middle").index(each[1].image))
-        == ways[: 2 if num_rough == 1 else 3]
-    )
+    matrix = covariance.merge_images(by, WHOLE, Workers(1))
+    assert asked == list(ways[: 2 if num_rough < 2 else 3])
     if num_rough == 3:
         assert matrix is None
     else:
-        np.testing.assert_allclose(matrix, ways[num_rough][1].inflation * gradients.T @ gradients)
+        inflation = ways[num_rough].inflation if num_rough else 2.0 / (1.0 / 1.1 + 1.0 / 0.36)
+        np.testing.assert_allclose(matrix, inflation * told)
 
 
-@pytest.mark.parametrize("is_partial", [False, True])
-def test_two_images_count_alike(found, monkeypatch, is_partial):
+def test_a_part_of_the_sphere_has_few_blocks_that_tell(found):
     prepared, pose, _ = found
     points = _points(prepared, pose)
-    gradients = np.random.default_rng(0).normal(size=(100, 6))
-    monkeypatch.setattr(covariance, "compute_hessian", lambda *_: np.eye(6))
-    monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
-    matrix = covariance.compute_covariance(prepared, points, pose, is_partial)
-    expected = 2.0 / (1.0 / 1.1 + 1.0 / 0.36) * gradients.T @ gradients
-    np.testing.assert_allclose(matrix, 100.0 / 93.0 * expected if is_partial else expected)
+    whole, part = (
+        covariance.compute_covariance(prepared.photo, points, pose, profile, WORKERS)
+        for profile in (WHOLE, PARTIAL)
+    )
+    num_blocks = len(covariance.sort_by_block(points)[1]) - 1
+    np.testing.assert_allclose(part, covariance.few_blocks_factor(num_blocks) * whole, rtol=5e-3)
+    assert covariance.few_blocks_factor(100) == pytest.approx(100.0 / 93.0)
 
 
 def test_a_direction_that_one_image_does_not_tell_is_told_by_the_other():
@@ -247,21 +247,21 @@ def test_points_that_occluders_hide_are_removed():
     assert left.weights.shape == (3,)
 
 
-def test_a_view_from_nearby_tells_the_covariance_without_what_occluders_hide(found, monkeypatch):
+def test_a_view_from_nearby_tells_the_covariance_without_what_occluders_hide(found):
     prepared, pose, _ = found
-    clear = compare(prepared, pose)
-    own, near = (covariance.estimate_covariance(prepared, pose, clear, place) for place in (None, pose))
+    clear = examine(prepared, pose)
+    own, near = (covariance.estimate_covariance(prepared, clear, WORKERS, place) for place in (None, pose))
     assert near.gaussian.covariance.tobytes() == own.gaussian.covariance.tobytes()
     rgb = query(2).rgb.copy()
     rgb[120:180, 100:180] = np.random.default_rng(0).integers(0, 256, (60, 80, 3))
     hidden = rooms.ask(as_panorama(rgb), prepared.scan_map, rooms.KNOWN)
-    seen = compare(hidden, pose)
-    shown = covariance.mask_occluders(hidden, seen)
-    assert shown is not hidden
-    masked = covariance.estimate_covariance(hidden, pose, seen)
-    unasked = replace(shown, photo=Photo(shown.photo.panorama))
-    monkeypatch.setattr(covariance, "mask_occluders", lambda *_: unasked)
-    left_out = covariance.estimate_covariance(hidden, pose, seen, pose)  # by the images that are there
+    candidate = examine(hidden, pose)
+    shown = covariance.mask_occluders(hidden, candidate.seen)
+    assert shown.photo is not hidden.photo
+    masked = covariance.estimate_covariance(hidden, candidate, WORKERS)
+    unasked = Unoccluded(shown.contradicts, Photo(shown.photo.panorama))
+    given = replace(candidate, unoccluded=unasked)
+    left_out = covariance.estimate_covariance(hidden, given, WORKERS, pose)  # by the images that are there
     variances = [np.diag(found.gaussian.covariance)[3:] for found in (left_out, masked)]
     np.testing.assert_allclose(*np.sqrt(variances), rtol=0.1)
 
@@ -283,7 +283,7 @@ def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
     assert 1 <= len(result.alternatives) <= 5
 
 
-def test_a_point_at_a_pole_of_the_photo_tells_nothing(found, monkeypatch):
+def test_a_point_at_a_pole_of_the_photo_tells_nothing(found):
     """Its pixels are so narrow that it would outweigh all others."""
     prepared, pose, _ = found
     taken = prepared.view_at(pose, "points").around(pose.center_world)
@@ -298,8 +298,8 @@ def test_a_point_at_a_pole_of_the_photo_tells_nothing(found, monkeypatch):
 
     kept = [len(covariance.remove_poles(with_one_at(d), pose).weights) for d in (down, away)]
     assert kept[1] == kept[0] + 1
-    seen = compare(prepared, pose)
-    expected = covariance.estimate_covariance(prepared, pose, seen).gaussian.covariance
-    monkeypatch.setattr(type(prepared), "view_at", lambda query, pose, name: with_one_at(down))
-    told = covariance.estimate_covariance(prepared, pose, seen).gaussian.covariance
+    candidate = examine(prepared, pose)
+    expected = covariance.estimate_covariance(prepared, candidate, WORKERS).gaussian.covariance
+    with_pole = replace(prepared, views=SimpleNamespace(points=lambda *_: with_one_at(down)))
+    told = covariance.estimate_covariance(with_pole, candidate, WORKERS).gaussian.covariance
     np.testing.assert_allclose(told, expected, rtol=0.02)

@@ -1,20 +1,20 @@
 """What may be taken of the memory, and that it is asked before much is."""
 
+import functools
 import os
+import resource
 import tracemalloc
-from types import SimpleNamespace
 
 import av
 import cv2
 import numpy as np
 import psutil
 import pytest
-from piccolo.localization.query import prepare_query
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 from PIL.PngImagePlugin import PngImageFile
 from refusals import assert_input_error
-from rooms import as_panorama, query, room, scan_map, stream
+from rooms import AUTO, as_panorama, ask as ask_photo, query, room, scan_map, stream
 
 from piccolo.cloud import octree, voxels as voxels_module
 from piccolo.cloud.stream import stream_of_arrays
@@ -25,44 +25,42 @@ from piccolo.localization.search import search_poses
 from piccolo.panorama import read_panorama
 from piccolo.panorama.photo import read_photo_facts
 from piccolo.panorama.video import frames_of
-from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.candidate_views import SEARCH_VIEW, render_views, render_wide
 
 
 @pytest.fixture
-def system(tmp_path, monkeypatch):
-    """A made-up machine and cgroup folder: 8 GB free, 1 GB taken."""
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=8 * 10**9))
-    monkeypatch.setattr(memory, "memory_taken", lambda: 1e9)
-    monkeypatch.setattr(memory, "OWN_CGROUPS", tmp_path / "own")
-    monkeypatch.setattr(memory, "CGROUPS", tmp_path / "cgroup")
-    monkeypatch.setattr(memory, "LIMIT", [])
-    monkeypatch.setattr(memory, "KNOWN", [])
-    return tmp_path
+def address_space():
+    """Limit the address space to so many bytes, or to so many more than are taken, until the test ends."""
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    yield lambda most: resource.setrlimit(resource.RLIMIT_AS, (int(most), limits[1]))
+    resource.setrlimit(resource.RLIMIT_AS, limits)
 
 
-def test_default_is_a_part_of_what_is_free_and_a_limit_counts_what_is_taken(system):
-    assert memory.memory_left() == pytest.approx(6.4e9)
-    memory.limit_memory(3.0)
-    assert memory.memory_left() == pytest.approx(2e9, rel=1e-4)
-    memory.check_memory(1.9e9, "a", "b")
-    with pytest.raises(InputError, match=r"^the grid needs 2.1 GB of memory, 2 GB may be used; cut it, or"):
-        memory.check_memory(2.1e9, "the grid", "cut it")
-    memory.limit_memory(500.0)
-    assert memory.memory_left() == pytest.approx(8e9)
+def test_default_is_a_part_of_what_is_free_and_a_limit_counts_what_is_taken(limiting):
+    assert memory.share_free(8e9, 1e9, None) == pytest.approx(6.4e9)
+    assert memory.share_free(8e9, 1e9, 3e9) == pytest.approx(2e9)
+    assert memory.share_free(8e9, 1e9, 500e9) == pytest.approx(8e9)
+    limiting(memory.memory_taken() / 1e9 + 0.2)
+    assert memory.memory_left() == pytest.approx(2e8, rel=0.02)
+    memory.check_memory(1.9e8, "a", "b")
+    with pytest.raises(
+        InputError, match=r"^the grid needs 0.21 GB of memory, 0.2 GB may be used; cut it, or"
+    ):
+        memory.check_memory(2.1e8, "the grid", "cut it")
     for wrong in (0.0, -1.0, float("nan")):
-        assert_input_error("`max_memory`: found", memory.limit_memory, wrong)
+        assert_input_error("`max_memory`: found", limiting, wrong)
 
 
-def test_a_small_part_of_what_was_left_a_moment_ago_is_not_measured_again(system, monkeypatch):
-    memory.check_memory(1e9, "a", "b")
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=1e6))
-    memory.check_memory(1e8, "a", "b")
-    with pytest.raises(InputError, match=r"^a needs 0.2 GB of memory, 0.0008 GB may be used; b, or"):
-        memory.check_memory(2e8, "a", "b")
-    with pytest.raises(InputError, match=r"^a needs 0.1 GB"):
-        memory.check_memory(1e8, "a", "b")
+def test_a_small_part_of_what_was_left_a_moment_ago_is_not_measured_again(limiting):
+    limiting(memory.memory_taken() / 1e9 + 0.1)
+    memory.check_memory(1e7, "a", "b")
+    memory.LIMIT[:] = [1.0]  # [byte]
+    memory.check_memory(1e6, "a", "b")
+    with pytest.raises(InputError, match=r"^a needs 0.003 GB of memory, 0 GB may be used; b, or"):
+        memory.check_memory(3e6, "a", "b")
+    with pytest.raises(InputError, match=r"^a needs 0.001 GB"):
+        memory.check_memory(1e6, "a", "b")
 
 
 V1 = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
@@ -72,21 +70,23 @@ V2 = "memory.max", "memory.current", "inactive_file"
 @pytest.mark.parametrize(
     ("line", "folder", "names"), [("0::/a/b", "a", V2), ("4:cpu,memory:/a", "memory/a", V1)]
 )
-def test_a_container_leaves_its_limit_less_what_is_used_but_for_caches(system, line, folder, names):
-    (system / "own").write_text(f"7:cpu:/a\n{line}\n")
-    assert memory.free_of_cgroup() == float("inf")
-    limit, usage, stat = (system / "cgroup" / folder / name for name in (*names[:2], "memory.stat"))
+def test_a_container_leaves_its_limit_less_what_is_used_but_for_caches(tmp_path, line, folder, names):
+    own = tmp_path / "own"
+    own.write_text(f"7:cpu:/a\n{line}\n")
+    free = functools.partial(memory.free_of_cgroup, own, tmp_path / "cgroup")
+    assert free() == float("inf")
+    limit, usage, stat = (tmp_path / "cgroup" / folder / name for name in (*names[:2], "memory.stat"))
     limit.parent.mkdir(parents=True)
     limit.write_text("3000000000\n")
     usage.write_text("1500000000\n")
     stat.write_text(f"anon 5\n{names[2]} 500000000\n")
-    assert memory.free_of_cgroup() == 2e9
+    assert free() == 2e9
     limit.write_text("max\n")
-    assert memory.free_of_cgroup() == float("inf")
+    assert free() == float("inf")
 
 
-def test_address_space_is_a_limit_too(monkeypatch):
-    monkeypatch.setattr(memory, "limit_of_process", lambda: 1e12)
+def test_address_space_is_a_limit_too(address_space):
+    address_space(1e12)
     assert 0.0 < memory.free_of_process() < 1e12
 
 
@@ -98,14 +98,14 @@ def test_systems_without_a_limit_of_address_space_or_of_cores(monkeypatch):
     assert 1 <= threads.num_cores() <= os.cpu_count()
 
 
-def test_work_begins_only_where_errors_can_still_be_raised(monkeypatch):
+def test_work_begins_only_where_errors_can_still_be_raised(address_space):
     cloud = stream_of_arrays(np.zeros((1000, 3)), np.arange(3000, dtype=np.uint8).reshape(1000, 3))
-    monkeypatch.setattr(memory, "free_of_process", lambda: 1.9e8)
+    address_space(memory.this_process().memory_info().vms + 1.9e8)
     with pytest.raises(MemoryError, match=r"^ulimit -v leaves 0.19 GB, wanted 0.2 or more"):
         cloud.read()
     with pytest.raises(MemoryError, match="ulimit"):
         list(Workers().map(abs, [1], "a"))
-    monkeypatch.setattr(memory, "free_of_process", lambda: 2e8)
+    address_space(memory.this_process().memory_info().vms + 5e8)
     assert list(Workers().map(abs, [-1], "a")) == [1]
     assert len(cloud.read().points) == 1000
 
@@ -148,27 +148,26 @@ def test_voxels_and_their_octree_take_what_they_say(monkeypatch):
         assert peak - at_first < 1.02 * num_bytes + 1e5
 
 
-def test_what_libraries_raise_when_memory_is_short(monkeypatch):
+def test_what_libraries_raise_when_memory_is_short(address_space):
     opencv = type("error", (Exception,), {"code": -4})
     for error in (MemoryError(), RuntimeError("can't start new thread"), opencv()):
         assert memory.is_shortage(error)
     assert not memory.is_shortage(RuntimeError("other"))
-    for most, is_one in ((1e9, True), (float("inf"), False)):  # C code that gives up
-        monkeypatch.setattr(memory, "limit_of_process", lambda most=most: most)
+    for most, is_one in ((1e12, True), (resource.RLIM_INFINITY, False)):  # C code that gives up
+        address_space(most)
         assert memory.is_shortage(SystemError("error return without exception set")) == is_one
         assert not memory.is_shortage(SystemError("other"))
 
 
-def test_all_that_grows_asks_first(monkeypatch, tmp_path):
+def test_all_that_grows_asks_first(limiting, tmp_path):
     picture = tmp_path / "a.png"
     whole, taken = scan_map(1), as_panorama(query(1).rgb)
     cv2.imwrite(str(picture), taken.rgb)
     rng = np.random.default_rng(0)
     table = voxels_module.VoxelTable("a.ply")
     workers = Workers(1)
-    asked = prepare_query(taken, whole, CoarseToFineSettings(), workers)
-    monkeypatch.setattr(memory, "memory_left", lambda: 1e5)
-    monkeypatch.setattr(memory, "KNOWN", [])
+    asked = ask_photo(taken, whole)
+    limiting(1e-6)
     spread, colors = rng.uniform(0, 90, (50_000, 3)), np.full((50_000, 3), 9, np.uint8)
     for text, ask in (
         ("a.png: found 512 x 256, which needs 0.0016 GB", lambda: read_panorama(picture)),
@@ -176,12 +175,12 @@ def test_all_that_grows_asks_first(monkeypatch, tmp_path):
         ("voxels of 2 cm needs", lambda: prepare_map(stream(room(1)[1]), workers)),
         ("prepared views", lambda: render_wide(whole.octree, whole.centers, SEARCH_VIEW, workers)),
         ("[0-9] views needs", lambda: render_views(whole.octree, whole.centers, SEARCH_VIEW, workers)),
-        ("rotations needs .*num_yaws", lambda: search_poses(asked, "known")),
+        ("rotations needs .*num_yaws", lambda: search_poses(asked, "known", AUTO.effort, workers)),
     ):
         assert_input_error(text, ask)
 
 
-def test_frames_of_a_video_are_asked_for_before_one_is_decoded(system, tmp_path):
+def test_frames_of_a_video_are_asked_for_before_one_is_decoded(limiting, tmp_path):
     path = tmp_path / "a.mp4"
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=1)
@@ -190,7 +189,7 @@ def test_frames_of_a_video_are_asked_for_before_one_is_decoded(system, tmp_path)
         for packet in (*stream.encode(frame), *stream.encode()):
             container.mux(packet)
     assert len(list(frames_of(path, 1.0, tmp_path))) == 1
-    memory.limit_memory(1.0 + 1e-5)
+    limiting(1e-5)
     with pytest.raises(InputError, match=r"a.mp4: frames of 256 x 128 needs? .* make the video smaller"):
         next(frames_of(path, 1.0, tmp_path))
 

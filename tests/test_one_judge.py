@@ -5,25 +5,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rooms
+from made_up import PROBLEM, make_candidate, make_selection
 from test_focal_length import TRUE
 from test_localize_cameras import place, scan
 from test_walk import _walk_through
 
 import piccolo
 from piccolo.camera import Mount
-from piccolo.camera.model import pinhole, whole_sphere
-from piccolo.confidence.alternatives import Hypothesis
+from piccolo.camera.model import pinhole
 from piccolo.confidence.confidence import Standing
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
+from piccolo.judge.case import UNKNOWN_ERRORS, Case, Geometry, Measured
+from piccolo.judge.conclude import MIRRORED, NOT_AS_CLAIMED
 from piccolo.judge.reasons import Reason
-from piccolo.localization import judge as judging
-from piccolo.localization.covariance import UNKNOWN_ERRORS
-from piccolo.localization.judge import MIRRORED, NOT_AS_CLAIMED
-from piccolo.localization.selection import Selection
-from piccolo.localization.self_calibration import Estimate
-from piccolo.localization.sphere import SphereFit
+from piccolo.localization import judging
 from research.synthetic.world import photograph, render_picture
 
 HERE = Pose(np.eye(3), np.zeros(3))
@@ -44,15 +41,15 @@ def test_what_lies_mirrored_or_contradicts_its_focal_length_is_ruled_out(
     monkeypatch, probability, doubt, conflict, is_mirrored, status, warns, num_asked
 ):
     asked = []
-    monkeypatch.setattr(judging, "is_mirrored", lambda _, best: asked.append(best) or is_mirrored)
-    query = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1))
-    nothing = Estimate(np.zeros(3), np.zeros((3, 3)), np.zeros((6, 3)))
-    fit = SphereFit(whole_sphere(64, 32), nothing, is_claimed=True, conflict=conflict, doubt=doubt)
-    found = Selection(Hypothesis(HERE, 0.5), ())
-    measured = judging.Measured(HERE, UNKNOWN_ERRORS, 0.05, None)
-    standings = [Standing(1.0, 0.5, 60, "drawn scan")]
+    mirrored = make_candidate(0.0, 0.9 if is_mirrored else 0.4, 80)
+    monkeypatch.setattr(judging, "find_mirrored", lambda _, best, *how: asked.append(best) or mirrored)
+    geometry = Geometry((), doubt, conflict, 0.0)
+    found = make_selection(make_candidate(0.0, 0.5, 60))
+    measured = Measured(HERE, UNKNOWN_ERRORS, 0.05, None, ())
+    case = Case(found, (Standing(1.0, 0.5, 60, "drawn scan"),), measured, geometry)
     belief = make_belief([probability])
-    result = judging.conclude(query, found, fit, measured, standings, belief)
+    problem = replace(PROBLEM, scan_map=rooms.scan_map(1))
+    result = judging.decide_case(problem, case, belief, rooms.means(), 0.9)
     assert (result.status, MIRRORED in result.warnings, len(asked)) == (status, warns, num_asked)
     reasons = {Reason.MIRRORED} if warns else {Reason.SPHERE} if conflict else set()
     assert result.belief == replace(belief, doubt=doubt, ruled_out=frozenset(reasons))

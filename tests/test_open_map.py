@@ -268,16 +268,16 @@ def test_the_cache_keeps_them_for_the_next_process(opened, finding):
 
 def test_looking_for_them_is_told_and_is_no_work_on_the_photo(opened, finding, caplog):
     first = opened()
-    watch = Stopwatch()
-    query = rooms.ask(rooms.scene(1)[1], first)
+    means = rooms.means()
+    problem = rooms.ask(rooms.scene(1)[1], first)
     with caplog.at_level("INFO", "piccolo"):
-        poses = match_poses(query, watch)
+        poses, _ = match_poses(problem, means)
     assert "tools/prepare_map.py" in caplog.text
     assert not first.awaits_features
-    assert sorted(watch.seconds) == ["match", "prepare"]
-    again = Stopwatch()
-    assert [p.key for p in match_poses(query, again)] == [p.key for p in poses]
-    assert list(again.seconds) == ["match"]
+    assert sorted(means.watch.seconds) == ["match", "prepare"]
+    again = rooms.means()
+    assert [p.key for p in match_poses(problem, again)[0]] == [p.key for p in poses]
+    assert list(again.watch.seconds) == ["match"]
     assert finding == [1]
 
 

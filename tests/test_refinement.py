@@ -1,6 +1,5 @@
 """Descents on the views of a room, and decisions of the refinement, each in a made-up case."""
 
-import collections
 import functools
 from dataclasses import replace
 from types import SimpleNamespace
@@ -8,43 +7,32 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rooms
-from made_up import QUERY, VIEWS, at, place
-from piccolo.localization.query import Cache
+from made_up import PARTIAL, PROBLEM, WHOLE, at, make_candidate, move, place
 
 from piccolo.confidence.alternatives import Hypothesis
-from piccolo.evidence.comparison import CONTRADICTS, Comparison
+from piccolo.evidence.examine import examine
 from piccolo.geometry.cone import EVERYWHERE
 from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose import Pose, step
 from piccolo.geometry.sphere import make_grid
 from piccolo.jobs.threads import Workers
-from piccolo.localization import beam, ladder, query as query_module, settings
-from piccolo.localization.beam import Ends, best_and_alternatives, narrow
-from piccolo.localization.ladder import AROUND_MIDDLE, FINE, SECOND, Limits
+from piccolo.judge.candidate import CONTRADICTS, Comparison
+from piccolo.localization import beam, ladder
+from piccolo.localization.beam import best_and_alternatives, narrow
 from piccolo.localization.search import Starts
+from piccolo.optimize.channel_loss import NUM_BLOCKS
+from piccolo.problem.profile import VIEWS, WHOLE_BEAM
+from piccolo.problem.stages import AROUND_MIDDLE, FINE, FULL, LAST, NEARLY, SECOND, Limits, Rounds
+from piccolo.views.points_around import round_position
 from piccolo.views.view import Cells
 
-FINE_BLOCKS = settings.VIEWS["fine"].arrays.blocks
+FINE_BLOCKS = VIEWS["fine"].arrays.blocks
 ALL = np.ones(len(FINE_BLOCKS), bool)
-
-
-def _fit(x, score, yaw_deg=0.0):
-    return at(x, score, yaw_deg)
-
-
-def _asked(is_partial=False):
-    """A query whose images are their names, of a photo that shows all cells."""
-    photo = SimpleNamespace(
-        image=lambda name: name,
-        find_shown_cells=lambda *_: np.ones(3),
-        find_cone=lambda *_: EVERYWHERE,
-        is_partial=is_partial,
-    )
-    return replace(QUERY, photo=photo, cache=Cache(VIEWS))
+ALONE = Workers(1)
 
 
 @functools.lru_cache
-def _query(seed):
+def _problem(seed):
     return rooms.ask(rooms.scene(seed)[1], rooms.scan_map(seed))
 
 
@@ -60,7 +48,7 @@ def _query(seed):
     ],
 )
 def test_poses_far_fainter_than_the_best_are_not_compared(scores, kept):
-    found = beam.keep_comparable([_fit(k, score) for k, score in enumerate(scores)])
+    found = beam.keep_comparable([at(k, score) for k, score in enumerate(scores)])
     assert sorted((h.score for h in found), reverse=True) == kept
 
 
@@ -81,39 +69,31 @@ def test_a_quarter_of_the_beam_is_for_the_best_that_lie_far_apart():
 
 
 def test_narrow_ranks_poses_first():
-    close = [_fit(0.0, 0.5), _fit(0.05, 0.9), _fit(3.0, 0.1), _fit(5.0, 0.7)]
+    close = [at(0.0, 0.5), at(0.05, 0.9), at(3.0, 0.1), at(5.0, 0.7)]
     assert [place(pose) for pose in narrow(close, 4)] == [0.05, 5.0, 3.0]
     assert [place(pose) for pose in narrow(close, 1)] == [0.05]
-    turned = [_fit(0.0, 0.9), _fit(0.09, 0.8), _fit(0.11, 0.7), _fit(0.0, 0.6, 4.9), _fit(0.0, 0.5, 5.1)]
+    turned = [at(0.0, 0.9), at(0.09, 0.8), at(0.11, 0.7), at(0.0, 0.6, 4.9), at(0.0, 0.5, 5.1)]
     assert narrow(turned, 8) == [turned[k].pose for k in (0, 2, 4)]
 
 
-@pytest.mark.parametrize(("is_partial", "first"), [(False, 5), (True, 12)])
-def test_the_beam_narrows_from_stage_to_stage(monkeypatch, is_partial, first):
+def test_the_beam_narrows_from_stage_to_stage():
     """From 500 starts to 400, 48 and 8 poses, of which two are perturbed for as long as that helps.
 
-    The first descents of a photo of a part of the sphere are as long as the second.
+    In a grey photo no pose is better than another. The first descents of a photo of a part of the sphere are
+    as long as the second.
     """
-    made, descents = collections.Counter(), []
-
-    def descend_prepared(query, starts, stage):
-        descents.append((stage.limits.num_iterations, len(starts.candidate)))
-        return Ends(starts, None)
-
-    def done(name, query, found, first=None):
-        made[first or name] += 1
-        pose = getattr(found, "pose", found)
-        return Hypothesis(pose, 0.1 - 1e-5 * place(pose))
-
-    monkeypatch.setattr(beam, "descend_prepared", descend_prepared)
-    for name in ("refine", "climb", "score_pose"):
-        monkeypatch.setattr(beam, name, functools.partial(done, name))
+    gray = rooms.as_panorama(np.full((256, 512, 3), 128, np.uint8))
+    problem = rooms.ask(gray, rooms.scan_map(1))
+    workers, asked = rooms.listen()
     centers = np.outer(np.arange(500), [1.0, 0.0, 0.0])
-    starts = Starts(np.repeat(np.eye(3)[None], 500, axis=0), centers, np.arange(500))
-    found = beam.refine_starts(_asked(is_partial), starts, settings.WHOLE_BEAM)
-    assert descents == [(first, 500), (12, 400)]
-    assert list(made.values()) == [48, 8, 8, 2, 12]
-    assert [place(h.pose) for h in found] == list(range(12))
+    starts = Starts(np.repeat(np.eye(3)[None], 500, axis=0), centers, np.zeros(500, np.int64))
+    found = beam.refine_starts(problem, starts, WHOLE_BEAM, workers)
+    around = len(ladder.perturbations(1.0)) // ladder.PERTURBED_BATCH
+    counts = [total for label, total in asked if label == "descend" and total != around]
+    assert counts == [-(-500 // beam.BATCH), 400 // beam.BATCH, 48, 8, 8, 2, 12]
+    assert [sum(h.is_climbed for h in found), len(found)] == [2, 12]
+    assert [one.first.limits.num_iterations for one in (WHOLE, PARTIAL)] == [5, 12]
+    assert SECOND.limits.num_iterations == 12
 
 
 # Perturbations and the last millimetres
@@ -126,28 +106,30 @@ def test_the_beam_narrows_from_stage_to_stage(monkeypatch, is_partial, first):
 def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, rounds, expected):
     left, sizes = list(gains), []
 
-    def around(query, cells, pose, stage):
+    def around(problem, cells, pose, stage, workers):
         sizes.append(stage.around.size)
         assert (stage.around.image, stage.image) == ("middle", "fine")
         return Hypothesis(pose, score[0])
 
-    def fine(query, pose, stage):
+    def fine(problem, pose, workers, stage):
         assert stage is FINE
         score[0] += left.pop(0)
         return Hypothesis(pose, score[0])
 
     score = [0.5]
-    monkeypatch.setattr(query_module, "normalize_view", lambda *_: None)
-    monkeypatch.setattr(ladder, "score_on_cells", lambda *_: _fit(0.0, 0.5))  # whatever another view said
+    monkeypatch.setattr(ladder, "score_on_cells", lambda *_: at(0.0, 0.5))
     monkeypatch.setattr(ladder, "descend_around", around)
     monkeypatch.setattr(ladder, "refine", fine)
-    query = _asked()
-    found = ladder.climb(query, _fit(0.0, 0.9))
+    asked = SimpleNamespace(view_at=lambda *_: None, photo=SimpleNamespace(image=lambda name: name))
+    found = ladder.climb(asked, at(0.0, 0.9).pose, ALONE)
     assert found.score == pytest.approx(expected)
+    assert found.is_climbed
     assert sizes == [0.4] * rounds
-    again = Hypothesis(found.pose, 0.3)
-    assert ladder.climb(query, again) is again
-    assert sizes == [0.4] * rounds
+
+
+def test_what_has_climbed_climbs_no_more():
+    climbed = make_candidate(0.0, 0.3, is_climbed=True)
+    assert ladder.climb_whole(PROBLEM, climbed, ALONE) is climbed
 
 
 @pytest.mark.parametrize(
@@ -161,87 +143,98 @@ def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, round
     ],
 )
 def test_occluders_are_masked_again_where_that_gains(monkeypatch, is_masked, scores, rounds, end):
-    query, masked, made = _asked(), _asked(), []
-    correlation = np.array([0.9, CONTRADICTS - 0.01 if is_masked else 0.9])
-    seen = Comparison(correlation, np.ones(2), np.ones(2), 2.0)
-    monkeypatch.setattr(ladder, "score_pose", lambda query, pose: at(place(pose), scores[int(place(pose))]))
-    monkeypatch.setattr(ladder, "compare", lambda query, pose: seen)
-    monkeypatch.setattr(ladder, "mask_occluders", lambda query, seen: masked if is_masked else query)
+    made = []
+    whole = SimpleNamespace(mask=lambda is_hidden: "masked")
+    correlation = np.full(NUM_BLOCKS, 0.9)
+    correlation[-1] = CONTRADICTS - 0.01 if is_masked else 0.9
+    seen = Comparison(correlation, np.ones(NUM_BLOCKS), np.ones(NUM_BLOCKS), 1.0)
 
-    def refine(shown, pose, *stages):
-        assert stages == (AROUND_MIDDLE, FINE)
-        made.append(shown)
-        return Hypothesis(pose, 0.0)
+    def climb(problem, start, workers):
+        made.append(start.unoccluded.photo)
+        return replace(move(start, 1.0), score=scores[len(made)])
 
-    def climb(shown, start):
-        made.append(shown)
-        return at(place(start.pose) + 1, 0)
-
-    monkeypatch.setattr(ladder, "refine", refine)
-    monkeypatch.setattr(ladder, "climb", climb)
-    shown, found = ladder.climb_unoccluded(query, at(0.0, 0.0).pose)
-    assert made == ([masked] * 2 * rounds if is_masked else [query])
-    assert shown is made[-1]
+    monkeypatch.setattr(ladder, "climb_masked", climb)
+    monkeypatch.setattr(ladder, "climb_whole", climb)
+    start = replace(make_candidate(0.0, scores[0]), seen=seen)
+    found = ladder.climb_unoccluded(replace(PROBLEM, photo=whole), start, ALONE)
+    assert made == ["masked" if is_masked else whole] * rounds
+    assert found.unoccluded.photo == made[-1]
     assert (place(found.pose), found.score) == (end, scores[end])
 
 
-@pytest.mark.parametrize(("after", "is_taken"), [(0.60, True), (0.475, True), (0.46, False), (0.1, False)])
-def test_full_resolution_is_taken_back_where_the_score_falls(monkeypatch, after, is_taken):
+@pytest.fixture(scope="module")
+def settled():
+    """A problem, a candidate near the true pose, and that at rest."""
+    problem = _problem(1)
+    start = examine(problem, step(rooms.scene(1)[2], np.array([0, 0, 0, 0.02, 0.01, 0.0])))
+    return problem, start, ladder.settle(problem, start, ALONE)
+
+
+@pytest.mark.parametrize(("share", "is_taken"), [(0.5, True), (0.89, True), (0.91, True), (1.12, False)])
+def test_full_resolution_is_taken_back_where_the_score_falls(settled, share, is_taken):
     """By a tenth at most may it fall, in exchange for millimetres."""
-    moved, start = at(0.04, after), at(0.0, 0.52)
-    asked = []
-    clear = Comparison(np.ones(1), np.ones(1), np.ones(1), 1.0)
-    monkeypatch.setattr(ladder, "climb_unoccluded", lambda query, pose: (query, start))
-    monkeypatch.setattr(ladder, "compare", lambda query, pose: clear)
-    monkeypatch.setattr(ladder, "score_pose", lambda query, pose: Hypothesis(pose, after))
-    monkeypatch.setattr(type(QUERY), "view_at", lambda query, pose, name: asked.append((place(pose), name)))
-    monkeypatch.setattr(ladder, "descend", lambda *_: moved.pose)
-    expected = moved if is_taken else start
-    query = _asked()
-    assert ladder.climb_to_full(query, start.pose) == expected
-    assert asked == [(0.0, "points"), (0.04, "points")]  # they are taken again from where the pose is
-    assert ladder.settle(query, start) == expected
-    assert len(asked) == 4  # the second round of settling moves nothing
-    monkeypatch.setattr(ladder, "descend", lambda *_: at(len(asked), 0.0).pose)
-    ladder.settle(query, start)
-    assert len(asked) == 10  # six rounds at most
-    monkeypatch.setattr(ladder, "descend", lambda *_: at(0.019, 0.0).pose)
-    ladder.climb_to_full(query, start.pose)
-    assert len(asked) == 11  # so near by it sees the same points
+    problem, start, rest = settled
+    before = replace(start, score=share * rest.score)
+    end = ladder.settle(problem, before, ALONE)
+    if is_taken:
+        assert (end.pose.key, end.score) == (rest.pose.key, rest.score)
+    else:
+        assert (end.pose, end.score) == (start.pose, before.score)
 
 
-def test_cells_and_points_are_those_that_the_photo_shows(monkeypatch):
+def test_points_are_taken_again_from_where_the_pose_is_until_it_hardly_moves(settled):
+    problem, start, _ = settled
+    places = []
+
+    def points(place, *shown):
+        places.append(place)
+        return problem.views.points(place, *shown)
+
+    views = SimpleNamespace(points=points, averages=problem.views.averages)
+    asked = replace(problem, views=views)
+    shown = ladder.mask_occluders(problem, start.seen)
+    begin = replace(start, unoccluded=shown)
+    near = ladder.converge(asked, begin, LAST._replace(rounds=Rounds(6, np.inf)), ALONE)
+    assert places == [round_position(start.pose)]
+    places.clear()
+    ladder.converge(asked, begin, LAST._replace(rounds=Rounds(6, 0.0)), ALONE)
+    assert places[:2] == [round_position(start.pose), round_position(near.pose)]
+    assert len(places) == 6
+    assert (LAST.rounds, FULL.rounds) == ((6, 1e-4), (2, NEARLY))
+
+
+def test_cells_and_points_are_those_that_the_photo_shows():
     """Cells around the camera that point where the photo has a picture; all, for a photo of a sphere."""
-    whole, pose = _query(1), at(0.0, 0.0, 70.0).pose
+    whole, pose = _problem(1), at(0.0, 0.0, 70.0).pose
     is_hidden = ~(np.abs(np.arange(16) - 4) < 2) & np.ones((8, 1), bool)  # but a fifth, around the left
-    narrow = whole.mask(is_hidden)
-    grid = make_grid(settings.VIEWS["points"].num_rings)
+    narrow = whole.show(whole.photo.mask(is_hidden))
+    grid = make_grid(VIEWS["points"].num_rings)
     azimuth = np.degrees(np.arctan2(*(grid.directions @ pose.R_cam_from_world.T).T[1::-1]))
-    shown = narrow.photo.find_shown_cells(settings.VIEWS["points"].num_rings, pose)
-    assert whole.photo.find_shown_cells(settings.VIEWS["points"].num_rings, pose).all()
-    cone = narrow.photo.find_cone(settings.VIEWS["points"].num_rings, pose)
+    shown = narrow.photo.find_shown_cells(VIEWS["points"].num_rings, pose)
+    assert whole.photo.find_shown_cells(VIEWS["points"].num_rings, pose).all()
+    cone = narrow.photo.find_cone(VIEWS["points"].num_rings, pose)
     assert (grid.directions[shown] @ cone.axis > cone.cos_angle).all()
     assert (grid.directions @ cone.axis > cone.cos_angle).mean() < 0.8
-    assert whole.photo.find_cone(settings.VIEWS["points"].num_rings, pose) == EVERYWHERE
+    assert whole.photo.find_cone(VIEWS["points"].num_rings, pose) == EVERYWHERE
     is_inside = np.abs((azimuth - 78.75 + 180) % 360 - 180) < 33.75
     assert (shown == is_inside).mean() > 0.98
-    monkeypatch.setattr(query_module, "normalize_view", lambda sums, center, config, shown: shown)
-    views = SimpleNamespace(averages=lambda *_: None, points=lambda place, config, *shown: shown)
-    asked = replace(narrow, cache=Cache(views))
-    assert (asked.view_at(pose, "fine") == shown).all()
+    cells, of_all = (problem.view_at(pose, "fine") for problem in (narrow, whole))
+    np.testing.assert_array_equal(cells.weights, of_all.weights * shown)
+    assert (of_all.weights[~shown] > 0.0).any()
+    asked = replace(narrow, views=SimpleNamespace(points=lambda place, config, *shown: shown))
     assert asked.view_at(pose, "points") == (shown.tobytes(), cone, 30_000)
 
 
 @pytest.mark.parametrize(("seed", "most"), [(1, 5e-5), (3, 5e-4), (4, 5e-5)])
 def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
     """Starts 5 mm apart end within 0.05 mm where the loss has one minimum; in noise it has several."""
-    query, true_pose = _query(seed), rooms.scene(seed)[2]
+    problem, true_pose = _problem(seed), rooms.scene(seed)[2]
     ends = [
-        ladder.settle(query, Hypothesis(step(true_pose, np.array([0, 0, 0, *d])), 0.0)).pose
+        ladder.settle(problem, examine(problem, step(true_pose, np.array([0, 0, 0, *d]))), ALONE).pose
         for d in ([0.002, 0.001, 0.0], [-0.002, -0.001, 0.002])
     ]
     rooms.assert_near(*ends, most, 0.03)
-    again = ladder.settle(query, Hypothesis(ends[0], 0.0)).pose
+    again = ladder.settle(problem, examine(problem, ends[0]), ALONE).pose
     assert rooms.errors(again, ends[0])[0] < 2e-5
     assert rooms.errors(ends[0], true_pose)[0] < 0.01
 
@@ -253,11 +246,11 @@ def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
 def _fine():
     true_pose = rooms.scene(1)[2]
     octree = rooms.scan_map(1).octree
-    return rooms.view(octree, true_pose.center_world, settings.VIEWS["fine"], ALL), true_pose
+    return rooms.view(octree, true_pose.center_world, VIEWS["fine"], ALL), true_pose
 
 
 def test_descent_finds_the_true_pose_again():
-    (cells, true_pose), image = _fine(), _query(1).photo.images.fine()
+    (cells, true_pose), image = _fine(), _problem(1).photo.images.fine()
     off = step(true_pose, np.array([0.03, -0.02, 0.04, 0.06, -0.05, 0.04]))
     pose = ladder.descend(cells, image, off, Limits(1.0, 30, 1e-5))
     assert rooms.errors(pose, true_pose)[0] < 0.01
@@ -267,13 +260,12 @@ def test_descent_finds_the_true_pose_again():
 
 
 def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
-    (_, true_pose), images = _fine(), _query(1).photo.images
+    (_, true_pose), images = _fine(), _problem(1).photo.images
     off = step(true_pose, ladder.perturbations(1.0)[1])
     assert rooms.errors(off, true_pose)[0] > 0.2
-    cells = rooms.view(rooms.scan_map(1).octree, off.center_world, settings.VIEWS["fine"], ALL)
+    cells = rooms.view(rooms.scan_map(1).octree, off.center_world, VIEWS["fine"], ALL)
     stage = AROUND_MIDDLE._replace(view="fine")
-    queries = (replace(_query(1), workers=Workers(n)) for n in (1, 2))
-    found, by_two = (ladder.descend_around(query, cells, off, stage) for query in queries)
+    found, by_two = (ladder.descend_around(_problem(1), cells, off, stage, Workers(n)) for n in (1, 2))
     assert (found.pose.key, found.score) == (by_two.pose.key, by_two.score)
     assert rooms.errors(found.pose, true_pose)[0] < 0.06
     expected = ladder.score_on_cells(cells, FINE_BLOCKS, images.middle(), found.pose)
@@ -281,12 +273,12 @@ def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
 
 
 def test_starts_descend_on_their_candidates_views_as_one_does_alone():
-    scan_map, (_, true_pose), image = rooms.scan_map(1), _fine(), _query(1).photo.images.search()
+    scan_map, (_, true_pose), image = rooms.scan_map(1), _fine(), _problem(1).photo.images.search()
     distance = np.linalg.norm(scan_map.centers - true_pose.center_world, axis=1)
     k, far = int(np.argmin(distance)), int(np.argmax(distance))
     candidate, R = np.array([k, far, k]), true_pose.R_cam_from_world
     starts = Starts(np.stack([R] * 3), scan_map.centers[candidate], candidate)
-    ends, scores = beam.descend_prepared(_query(1), starts, SECOND)
+    ends, scores = beam.descend_prepared(_problem(1), starts, SECOND, rooms.WORKERS)
     assert ends.candidate.tolist() == [k, k, far]  # the best first
     assert scores[0] == scores[1] > max(0.4, scores[2])
     (row,), views = scan_map.views.at(np.array([k]), Workers(1))

@@ -6,7 +6,6 @@ import naive
 import numpy as np
 import pytest
 import rooms
-from piccolo.localization.photo import make_images
 from pictures import encoded, with_metadata, xmp_packet
 
 from piccolo.geometry.pose import angle_between, exp_so3, uniform_rotations, uniform_yaws
@@ -18,16 +17,25 @@ from piccolo.panorama.gpano import GPano
 from piccolo.panorama.local_normalization import normalize_panorama, sample_channels
 from piccolo.panorama.model import resize
 from piccolo.photo import Photo, Prior
-from piccolo.problem.settings import CoarseToFineSettings, ImageScales
+from piccolo.problem.photo_images import make_images
+from piccolo.problem.profile import ImageScales
+from piccolo.problem.settings import Effort
 from research.synthetic.world import mask_outside_field
 
 AREA = make_grid(24).solid_angle
+EFFORT = Effort(num_yaws=12, num_rotations=2000, max_starts=4000)
 
 
 @functools.lru_cache
-def _query(gpano=None):
+def _problem(gpano=None):
     panorama = dataclasses.replace(rooms.scene(1)[1], gpano=gpano)
-    return rooms.ask(panorama, rooms.scan_map(1), CoarseToFineSettings(num_yaws=12))
+    return rooms.ask(panorama, rooms.scan_map(1))
+
+
+def _narrow(is_hidden, gpano=None):
+    """The problem of the photo without some pixels."""
+    panorama = dataclasses.replace(rooms.scene(1)[1], gpano=gpano)
+    return rooms.ask(dataclasses.replace(panorama, is_valid=~is_hidden), rooms.scan_map(1))
 
 
 def _levels(texels):
@@ -78,10 +86,10 @@ def test_wide_samples_are_averages_by_area():
 def test_best_score_is_near_the_true_pose(tilts, most):
     true_pose, scan_map = rooms.scene(1)[2], rooms.scan_map(1)
     rotations = uniform_yaws(48) if tilts == "known" else uniform_rotations(2000)
-    samples, validity = search.turn_panorama(_query().photo.images.search(), rotations)
+    samples, validity = search.turn_panorama(_problem().photo.images.search(), rotations)
     sparse, rotation, values = search.best_poses_wide(scan_map, samples, validity, 200, Workers(2))
     assert (np.diff(values) <= 0).all()
-    starts = search.search_poses(_query(), tilts)
+    starts = search.search_poses(_problem(), tilts, EFFORT, rooms.WORKERS)
     centers = scan_map.centers[scan_map.sparse[sparse]]
     for found in ((centers, rotations[rotation]), (starts.center_map, starts.R_cam_from_map)):
         near = [
@@ -94,7 +102,7 @@ def test_best_score_is_near_the_true_pose(tilts, most):
 
 def test_a_part_of_the_candidates_at_a_time_gives_the_same_poses(monkeypatch):
     scan_map, rotations = rooms.scan_map(1), uniform_rotations(200)
-    samples, validity = search.turn_panorama(_query().photo.images.search(), rotations)
+    samples, validity = search.turn_panorama(_problem().photo.images.search(), rotations)
     whole = search.best_poses_wide(scan_map, samples, validity, 500, Workers(1))
     monkeypatch.setattr(search, "BLOCK", 7)
     monkeypatch.setattr(search, "SCORES_AT_ONCE", 30 * len(rotations))
@@ -127,7 +135,9 @@ def test_best_poses_are_the_largest_that_have_more_than_the_least(rank, count):
 
 def test_tilt_in_the_metadata_is_that_of_every_start():
     """Pitch raises the image centre, roll lowers the camera's right side."""
-    starts = search.search_poses(_query(GPano(pitch_deg=20.0, roll_deg=10.0)), "known")
+    starts = search.search_poses(
+        _problem(GPano(pitch_deg=20.0, roll_deg=10.0)), "known", EFFORT, rooms.WORKERS
+    )
     forward, left, _ = starts.R_cam_from_map.transpose(1, 0, 2)
     np.testing.assert_allclose(np.degrees(np.arcsin(forward[:, 2])), 20.0, atol=1e-6)
     assert (left[:, 2] > 0.1).all()
@@ -147,7 +157,7 @@ def test_the_users_gravity_goes_before_the_tilt_in_the_metadata(tmp_path):
 
 def test_about_level_are_seven_pitches_in_forty_headings():
     """Without roll; neighbours in heading are as far apart as those in pitch."""
-    rotations = search.list_rotations(_query(), "level")
+    rotations = search.list_rotations(_problem(), "level", EFFORT)
     assert len(rotations) == 7 * 40
     forward, left, _ = rotations.transpose(1, 0, 2)
     products = rotations @ rotations.transpose(0, 2, 1)
@@ -164,9 +174,7 @@ def test_about_level_are_seven_pitches_in_forty_headings():
 
 def test_about_level_only_headings_that_the_prior_allows_are_searched():
     prior = Prior(heading_deg=90.0, heading_tolerance_deg=20.0)
-    query = _query()
-    asked = dataclasses.replace(query, settings=dataclasses.replace(query.settings, prior=prior))
-    rotations = search.list_rotations(asked, "level")
+    rotations = search.list_rotations(dataclasses.replace(_problem(), prior=prior), "level", EFFORT)
     forward = rotations[:, 0]
     assert len(rotations) == 7 * 5  # 72, 81, 90, 99, 108
     assert (np.abs(np.degrees(np.arctan2(forward[:, 0], forward[:, 1])) - 90.0) < 20.0).all()
@@ -174,25 +182,26 @@ def test_about_level_only_headings_that_the_prior_allows_are_searched():
 
 def test_a_known_tilt_is_searched_as_known_whatever_the_photo_shows():
     """With all yaws at that tilt, not about level."""
-    is_left = np.arange(1024) < 300
+    is_hidden = np.ones((256, 512), bool)
+    is_hidden[:, :150] = False
     for gpano, tilts in ((GPano(pitch_deg=0.0), "known"), (None, "level"), (GPano(pitch_deg=12.0), "known")):
-        narrow = _query(gpano).mask(~is_left & np.ones((512, 1), bool))
+        narrow = _narrow(is_hidden, gpano)
         assert narrow.photo.is_partial
         assert narrow.photo.has_tilt == (gpano is not None)
         planned = [run for _, run in attempts.plan_attempts(narrow) if hasattr(run, "keywords")]
         searched = [run.keywords["tilts"] for run in planned]
         assert searched == [tilts, "any"]
-        rotations = search.list_rotations(narrow, tilts)
+        rotations = search.list_rotations(narrow, tilts, EFFORT)
         if gpano is not None:
-            assert len(rotations) == narrow.settings.num_yaws
+            assert len(rotations) == EFFORT.num_yaws
             np.testing.assert_allclose(np.degrees(np.arcsin(rotations[:, 0, 2])), gpano.pitch_deg, atol=1e-6)
 
 
 def test_starts_of_a_narrow_photo_are_the_distinct_best_of_wide_views():
     """With the means subtracted; nearer in angle than those of a whole photo, and near the true pose."""
     true_pose = rooms.scene(1)[2]
-    narrow = _query().mask(mask_outside_field(512, 90.0, 0.5))
-    starts = search.search_poses(narrow, "level")
+    narrow = _narrow(mask_outside_field(512, 90.0, 0.5))
+    starts = search.search_poses(narrow, "level", EFFORT, rooms.WORKERS)
     near = [
         np.linalg.norm(center - true_pose.center_world) < 0.8
         and np.degrees(angle_between(R, true_pose.R_cam_from_world)) < 25
@@ -203,7 +212,7 @@ def test_starts_of_a_narrow_photo_are_the_distinct_best_of_wide_views():
     apart = np.array([rooms.errors(*pair) for pair in pairs])
     nearest = apart[apart[:, 0] < 0.5, 1].min()
     assert 14.0 <= nearest < 20.0
-    rotations = search.list_rotations(narrow, "level")
+    rotations = search.list_rotations(narrow, "level", EFFORT)
     samples, validity = search.turn_panorama(narrow.photo.images.search(), rotations)
     found = search.best_poses_wide(narrow.scan_map, samples, validity, 20, Workers(1), True)
     best = found[0][0], found[1][0]
@@ -213,10 +222,11 @@ def test_starts_of_a_narrow_photo_are_the_distinct_best_of_wide_views():
 
 @pytest.mark.parametrize("tilts", ["known", "any"])
 def test_heading_is_the_worlds_where_the_map_was_levelled(tilts):
-    query = _query()
-    tilted = dataclasses.replace(query.scan_map, R_map_from_world=exp_so3(np.array([0.4, 0.3, 1.0])))
-    settings = dataclasses.replace(query.settings, prior=Prior(heading_deg=70.0, heading_tolerance_deg=20.0))
-    starts = search.search_poses(dataclasses.replace(query, scan_map=tilted, settings=settings), tilts)
+    problem = _problem()
+    tilted = dataclasses.replace(problem.scan_map, R_map_from_world=exp_so3(np.array([0.4, 0.3, 1.0])))
+    prior = Prior(heading_deg=70.0, heading_tolerance_deg=20.0)
+    asked = dataclasses.replace(problem, scan_map=tilted, prior=prior)
+    starts = search.search_poses(asked, tilts, EFFORT, rooms.WORKERS)
     forward = (starts.R_cam_from_map @ tilted.R_map_from_world)[:, 0]
     off = np.degrees(np.arctan2(forward[:, 0], forward[:, 1])) - 70.0
     assert len(off) > 0
@@ -226,15 +236,14 @@ def test_heading_is_the_worlds_where_the_map_was_levelled(tilts):
 @pytest.mark.parametrize(("fewest", "most", "expected"), [(150, 4000, 150), (150, 20, 20), (1, 4000, None)])
 def test_number_of_starts(monkeypatch, fewest, most, expected):
     """One for every two candidates that are searched, but not fewer and not more than asked for."""
-    query = _query()
+    problem = _problem()
     monkeypatch.setattr(search, "MIN_STARTS", fewest)
-    settings = dataclasses.replace(query.settings, max_starts=most)
-    few = dataclasses.replace(query, settings=settings)
+    effort = EFFORT._replace(max_starts=most)
     for tilts in ("known", "any"):
-        starts = search.search_poses(few, tilts)
-        num_searched = len(query.scan_map.sparse)
+        starts = search.search_poses(problem, tilts, effort, rooms.WORKERS)
+        num_searched = len(problem.scan_map.sparse)
         assert len(starts.candidate) == (expected or num_searched // 2)
-        np.testing.assert_array_equal(starts.center_map, query.scan_map.centers[starts.candidate])
+        np.testing.assert_array_equal(starts.center_map, problem.scan_map.centers[starts.candidate])
         pairs = itertools.combinations(starts.poses(), 2)
         apart = np.array([rooms.errors(*pair) for pair in pairs])
         assert 0.5 <= apart[apart[:, 1] < 20.0, 0].min(initial=0.9) < 1.0

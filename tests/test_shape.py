@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import rooms
 from las_files import OFFSETS, las_bytes
-from made_up import at
+from made_up import PROBLEM, make_candidate, make_selection
 from meshes import SQUARE, write_obj
 from refusals import assert_input_error
 from scans import read_cloud
@@ -23,13 +23,13 @@ from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_COLORS, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.stream import open_cloud, stream_of_arrays
 from piccolo.cloud.surfaces import paint_shape
-from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.confidence import log_odds
 from piccolo.errors import InputError
+from piccolo.evidence.examine import complete, examine
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.sphere import compute_indices, pixel_rays
-from piccolo.jobs.threads import Stopwatch, Workers
-from piccolo.judge.selection import Selection, assess_alone
+from piccolo.jobs.threads import Workers
+from piccolo.judge.selection import assess_alone
 from piccolo.localization import localize as method
 from piccolo.localization.shape import align_lines
 from piccolo.panorama import Panorama
@@ -233,11 +233,12 @@ def test_tilts_and_headings_are_searched_until_a_pose_explains_the_edges(
     asked = []
 
     def at_tilt(name):
-        return SimpleNamespace(name=name, rotations=name, with_rotations=lambda _: at_tilt("any heading"))
+        return replace(PROBLEM, rotations=name)
 
-    def find(query, *_):
-        asked.append(query.name)
-        return method.Found(query, Selection(at(0.0, 0.9 if query.name == clear else 0.01), ()), None)
+    def find(problem, *_):
+        asked.append(problem.rotations or "any heading")
+        found = make_selection(make_candidate(0.0, 0.9 if asked[-1] == clear else 0.01))
+        return method.Found(problem, found, None)
 
     for name, made in {
         "find": find,
@@ -248,8 +249,8 @@ def test_tilts_and_headings_are_searched_until_a_pose_explains_the_edges(
     }.items():
         monkeypatch.setattr(method, name, made)
     scan_map = SimpleNamespace(yaw_of_walls=0.0)
-    found = method.find_by_edges(SimpleNamespace(source=None), scan_map, Stopwatch())
-    assert (found.query.name, asked) == (clear, searched)
+    found = method.find_by_edges(PROBLEM, scan_map, rooms.means())
+    assert (found.problem.rotations or "any heading", asked) == (clear, searched)
 
 
 def test_a_photo_of_another_room_is_not_localized():
@@ -276,8 +277,9 @@ def test_edges_drawn_at_the_true_pose_agree_better_than_elsewhere():
     taken = rooms.query(SEED, width=WIDTH)
     true_pose = _shape_map().from_world(taken.pose)
     beside = replace(true_pose, center_world=true_pose.center_world + np.array([0.3, 0.0, 0.0]))
-    query = rooms.ask(rooms.as_panorama(taken.rgb), _shape_map())
-    standings = assess_alone(query, [Hypothesis(pose, 0.2) for pose in (true_pose, beside)])
+    problem = rooms.ask(rooms.as_panorama(taken.rgb), _shape_map())
+    found = make_selection(*(replace(examine(problem, pose), score=0.2) for pose in (true_pose, beside)))
+    standings = assess_alone(problem.profile, complete(problem, found, rooms.WORKERS).ranked)
     assert standings[0].drawn_score > 1.5 * standings[1].drawn_score
     assert log_odds(standings[0]) > log_odds(standings[1])
 
@@ -287,8 +289,9 @@ def test_a_part_of_the_sphere_counts_less():
     is_valid = np.zeros(taken.rgb.shape[:2], bool)
     is_valid[:, : WIDTH // 4] = True
     for shown, ratio in ((np.ones_like(is_valid), 1.0), (is_valid, 0.5)):
-        query = rooms.ask(Panorama(taken.rgb, shown), _shape_map())
-        (standing,) = assess_alone(query, [Hypothesis(_shape_map().from_world(taken.pose), 0.2)])
+        problem = rooms.ask(Panorama(taken.rgb, shown), _shape_map())
+        candidate = replace(examine(problem, _shape_map().from_world(taken.pose)), score=0.2)
+        (standing,) = assess_alone(problem.profile, [candidate])
         assert standing.score == pytest.approx(0.2 * ratio, rel=0.02)
 
 

@@ -8,22 +8,26 @@ import cv2
 import numpy as np
 import pytest
 import rooms
+from made_up import PARTIAL, WHOLE, exact_matches, make_candidate, make_selection
+from rooms import WORKERS
 
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import morton_order
-from piccolo.confidence.alternatives import Hypothesis
 from piccolo.evidence import verification
-from piccolo.evidence.comparison import compare
 from piccolo.evidence.covariance import estimate_covariance, estimate_errors
+from piccolo.evidence.examine import complete, count_agreeing, examine
+from piccolo.evidence.measuring import measure
 from piccolo.geometry.pose import MAX_DISTANCE, Pose, exp_so3, log_so3, step, yaw_rotation
 from piccolo.geometry.pose_gaussian import LIKELY, subtract
 from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.jobs.threads import Workers
-from piccolo.judge import decide as judge
-from piccolo.judge.selection import Selection
+from piccolo.judge.candidate import Drawn
+from piccolo.judge.selection import find_rivals
 from piccolo.local_features.hypotheses import count_matches
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import NO_MATCHES
+from piccolo.localization.copies import list_copies
+from piccolo.localization.judging import Found, judge
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import Panorama
 from piccolo.photo import Prior
@@ -33,6 +37,7 @@ from research.synthetic.world import change_light, mask_outside_field, photograp
 
 NUM_POINTS = 200_000
 WIDTH = 1024
+APART = np.float32([6.0, 0.0, 0.0])  # [m] of a room and its twin
 SMALL = np.array([0.01, -0.02, 0.015, 0.05, -0.04, 0.03])  # [rad], [m]
 
 
@@ -42,14 +47,22 @@ def _narrow(seed=1, yaw=1.0):
     return Panorama(taken.rgb, ~mask_outside_field(WIDTH, 70.0, yaw)), taken.pose
 
 
-def _asked(num_threads=2):
-    """A query of its own, with an empty cache."""
-    return rooms.ask(_narrow()[0], rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN, num_threads)
-
-
 @functools.lru_cache
-def _query():
-    return _asked()
+def _problem():
+    return rooms.ask(_narrow()[0], rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
+
+
+def _draw(pose, workers=WORKERS):
+    """The matches with the scan drawn near a pose."""
+    return verification.draw_near(_problem(), pose, None, workers).matches
+
+
+def _verify(pose, workers=WORKERS):
+    return verification.verify(_problem(), pose, _draw(pose, workers))
+
+
+def _count(problem, pose):
+    return count_agreeing(problem, examine(problem, pose), WORKERS).num_matches
 
 
 @functools.lru_cache
@@ -72,12 +85,12 @@ def _beside():
     rng = np.random.default_rng(0)
     rgb = change_light(photograph(world.rooms[0], pose, WIDTH, Workers(2)), rng, rng)
     panorama = Panorama(rgb, _narrow()[0].is_valid)
-    query = rooms.ask(panorama, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
-    return verification.place_keypoints(query, rooms.local(1, pose, NUM_POINTS))
+    problem = rooms.ask(panorama, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
+    return verification.place_keypoints(problem, rooms.local(1, pose, NUM_POINTS), WORKERS)
 
 
 def test_a_photo_is_matched_with_one_beside_it_on_the_scan():
-    matches = verification.match_beside(_query(), _beside())
+    matches = verification.match_beside(_problem(), _beside(), WORKERS)
     agreeing = count_matches(matches, _true_pose(), verification.COS_AGREE)
     assert agreeing >= 20
     assert (np.diff(matches.query) >= 0).all()
@@ -89,8 +102,9 @@ def test_a_photo_is_matched_with_one_beside_it_on_the_scan():
 
 def test_what_moves_with_the_camera_is_no_match():
     """A photo matched with itself: of what is left, nothing is where the pose puts it."""
-    matches = verification.match_beside(_query(), verification.place_keypoints(_query(), _true_pose()))
-    assert len(matches.query) < 0.2 * len(_query().photo.seen().keypoints.rays)
+    own = verification.place_keypoints(_problem(), _true_pose(), WORKERS)
+    matches = verification.match_beside(_problem(), own, WORKERS)
+    assert len(matches.query) < 0.2 * len(_problem().photo.seen(WORKERS).keypoints.rays)
     assert count_matches(matches, _true_pose(), verification.COS_AGREE) == 0
 
 
@@ -98,42 +112,78 @@ def test_a_mirrored_photo_has_no_matches_beside():
     """It has some without that rule, as many things are symmetric."""
     taken = Panorama(_narrow()[0].rgb[:, ::-1].copy(), _narrow()[0].is_valid[:, ::-1].copy())
     mirrored = rooms.ask(taken, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
-    assert len(verification.match_pictures(mirrored.photo.seen().keypoints, _beside().keypoints)[0]) > 0
-    assert verification.match_beside(mirrored, _beside()) is NO_MATCHES
+    own = mirrored.photo.seen(WORKERS).keypoints
+    assert len(verification.match_pictures(own, _beside().keypoints)[0]) > 0
+    assert verification.match_beside(mirrored, _beside(), WORKERS) is NO_MATCHES
 
 
-def test_the_picture_with_the_most_matches_counts(monkeypatch):
-    query = replace(_query(), beside=(verification.match_beside(_query(), _beside()), NO_MATCHES))
-    assert rooms.errors(verification.verify(query, _true_pose()).pose, _true_pose())[0] < 0.03
-    assert verification.verify(query, _moved((0.0, 0.0, 0.0), 2.0)).num_matches <= 6
-    monkeypatch.setattr(verification, "matches_near", lambda *_: NO_MATCHES)
-    beside = verification.verify(query, _true_pose())
+def test_the_picture_with_the_most_matches_counts():
+    with_other = verification.match_beside(_problem(), _beside(), WORKERS)
+    problem = replace(_problem(), beside=(with_other, NO_MATCHES))
+    found = verification.verify(problem, _true_pose(), _draw(_true_pose()))
+    assert rooms.errors(found.pose, _true_pose())[0] < 0.03
+    turned = _moved((0.0, 0.0, 0.0), 2.0)
+    assert verification.verify(problem, turned, _draw(turned)).num_matches <= 6
+    beside = verification.verify(problem, _true_pose(), NO_MATCHES)
     assert beside.num_matches >= 20
     assert rooms.errors(beside.pose, _true_pose())[0] < 0.1
 
 
-def test_copies_of_a_place_are_where_the_drawn_scan_looks_the_same():
-    """In a scan of a room and its twin, scanned again: not elsewhere in the twin, nor near in the room."""
+@functools.lru_cache
+def _beside_its_twin():
+    """The problem in a scan of the room and its twin, scanned again, APART from it."""
     world, cloud = rooms.room(1, NUM_POINTS)
-    apart = np.float32([6.0, 0.0, 0.0])
     points, colors, _ = scan_world(world._replace(seed=99), NUM_POINTS, Workers(2))
-    twin = (points - cloud.origin_world).astype(np.float32) + apart
+    twin = (points - cloud.origin_world).astype(np.float32) + APART
     both = Cloud(np.vstack([cloud.points, twin]), np.vstack([cloud.colors, colors]), cloud.origin_world)
     order = morton_order(both.points, both.colors)
     both = Cloud(both.points[order], both.colors[order], both.origin_world)
-    query = rooms.ask(_narrow()[0], prepare_map(rooms.stream(both), Workers(2)), rooms.UNKNOWN)
-    here = query.scan_map.from_world(_narrow()[1])
+    return rooms.ask(_narrow()[0], prepare_map(rooms.stream(both), Workers(2)), rooms.UNKNOWN)
+
+
+def test_copies_of_a_place_are_where_the_drawn_scan_looks_the_same():
+    """Not elsewhere in the twin, nor near in the room."""
+    problem = _beside_its_twin()
+    here = problem.scan_map.from_world(_narrow()[1])
     moves = [(6.05, 0.0, 0.02), (6.9, -0.8, 0.0), (0.9, -0.8, 0.0)]
     others = [Pose(here.R_cam_from_world, here.center_world + move) for move in moves]
-    away = Pose(yaw_rotation(2.0) @ here.R_cam_from_world, here.center_world + apart)
-    assert verification.find_copies(query, here, [*others, away]) == [True, False, False, False]
-    assert verification.find_copies(query, here, []) == []
+    away = Pose(yaw_rotation(2.0) @ here.R_cam_from_world, here.center_world + APART)
+    found = verification.find_copies(problem, here, [*others, away], WORKERS)
+    assert found == [True, False, False, False]
+    assert verification.find_copies(problem, here, [], WORKERS) == []
+
+
+def test_copies_are_looked_for_among_poses_that_could_win():
+    problem = _beside_its_twin()
+    here = problem.scan_map.from_world(_narrow()[1])
+    twin = Pose(here.R_cam_from_world, here.center_world + APART)
+    known = [(here, 0.5, 20), (twin, 0.4, 18), (twin, 0.2, 18)]
+    found = make_selection(*(replace(make_candidate(0, *told), pose=pose) for pose, *told in known))
+    assert list_copies(problem, found, WORKERS) == [True, True, False]
+    workers, asked = rooms.listen()
+    assert list_copies(problem.by_views(), found, workers) == [False, False, False]
+    assert asked == []
+
+
+@pytest.mark.parametrize("is_copy", [True, False])
+def test_a_copy_of_its_place_that_is_likelier_becomes_the_best(is_copy):
+    """The likelier pose is the true one; the best is a little beside its twin, or turned away."""
+    problem = _beside_its_twin()
+    here = problem.scan_map.from_world(_narrow()[1])
+    R = here.R_cam_from_world if is_copy else yaw_rotation(2.0) @ here.R_cam_from_world
+    off = Pose(R, here.center_world + APART + np.array([0.15, 0.1, 0.0]))
+    found = make_selection(examine(problem, off), examine(problem, here))
+    means = rooms.means()
+    judged = judge(Found(problem, found, None), means, 0.9)
+    best = problem.scan_map.from_world(judged.pose)
+    assert best.distance(here if is_copy else off) < 0.1
+    assert len(judged.alternatives) == 1
+    assert len(means.trace.steps[-1]["candidates"]) == 2
 
 
 def test_keypoints_on_what_the_scan_does_not_show_are_left_out():
     rng = np.random.default_rng(0)
-    query = _asked()
-    panorama = query.photo.panorama
+    panorama = _problem().photo.panorama
     hidden = np.zeros(panorama.is_valid.shape, bool)
     hidden[230:300, 310:390] = True
     assert panorama.is_valid[hidden].all()
@@ -142,27 +192,27 @@ def test_keypoints_on_what_the_scan_does_not_show_are_left_out():
     rgb[230:300, 310:390] = poster
     given = Panorama(rgb, panorama.is_valid)
     occluded = rooms.ask(given, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
-    for asked, least, most in ((query, 0.5, 1.0), (occluded, 0.0, 0.1)):
-        seen = asked.photo.seen().keypoints.rays
-        kept = verification.place_keypoints(asked, _true_pose()).keypoints.rays
+    for asked, least, most in ((_problem(), 0.5, 1.0), (occluded, 0.0, 0.1)):
+        seen = asked.photo.seen(WORKERS).keypoints.rays
+        kept = verification.place_keypoints(asked, _true_pose(), WORKERS).keypoints.rays
         num_seen, num_kept = (hidden[compute_indices(rays, WIDTH)].sum() for rays in (seen, kept))
         assert num_seen > 10
         assert least * num_seen <= num_kept <= most * num_seen
 
 
 def test_the_true_pose_has_many_matches_and_wrong_ones_have_few():
-    right = verification.verify(_query(), _true_pose())
+    right = _verify(_true_pose())
     assert right.num_matches >= 20
-    assert verification.count_agreeing(_query(), _true_pose()) == right.num_matches
+    assert _count(_problem(), _true_pose()) == right.num_matches
     for wrong in (_moved((0.0, 0.0, 0.0), 2.0), _moved((1.0, -0.8, 0.0))):
-        assert verification.verify(_query(), wrong).num_matches <= 6
-        assert verification.count_agreeing(_query(), wrong) <= 6
+        assert _verify(wrong).num_matches <= 6
+        assert _count(_problem(), wrong) <= 6
 
 
 def test_a_pose_is_refined_towards_the_truth():
     off = step(_true_pose(), SMALL)
     before = rooms.errors(off, _true_pose())
-    found = verification.verify(_query(), off)
+    found = _verify(off)
     after = rooms.errors(found.pose, _true_pose())
     assert after[0] < min(0.02, 0.4 * before[0])
     assert after[1] < 0.4 * before[1]
@@ -172,82 +222,79 @@ def test_a_pose_is_refined_towards_the_truth():
 def test_matches_give_a_pose_whose_error_they_cover():
     squares = []
     for offset in (SMALL, -SMALL, 0.0 * SMALL):
-        pose, covariance = verification.place_by_matches(_query(), step(_true_pose(), offset))
+        start = step(_true_pose(), offset)
+        pose, covariance = verification.place_by_matches(start, _draw(start))
         off = subtract(_true_pose(), pose)
         squares.append(off @ np.linalg.solve(covariance, off))
         assert rooms.errors(pose, _true_pose())[0] < 0.03
     assert max(squares) < LIKELY
-    assert verification.place_by_matches(_query(), _moved((1.0, -0.8, 0.0))) is None
+    away = _moved((1.0, -0.8, 0.0))
+    assert verification.place_by_matches(away, _draw(away)) is None
 
 
 def test_a_pose_is_averaged_with_that_by_its_matches_unless_that_contradicts_the_prior():
     pose = step(_true_pose(), 0.5 * SMALL)
-    alone = estimate_covariance(_query(), pose, compare(_query(), pose))
-    found = estimate_errors(_query(), pose)
+    candidate = examine(_problem(), pose)
+    alone = estimate_covariance(_problem(), candidate, WORKERS)
+    found = estimate_errors(_problem(), candidate, WORKERS)
     assert rooms.errors(found.gaussian.pose, _true_pose())[0] < rooms.errors(pose, _true_pose())[0]
     assert found.std_of_fit == found.gaussian.largest_std < alone.std_of_fit
     moved = found.gaussian.pose.center_world - pose.center_world
     length = float(np.linalg.norm(moved))
     before = Pose(np.eye(3), pose.center_world - moved / length)  # a metre behind
-    near = tuple(_query().scan_map.to_world(before).center_world)
+    near = tuple(_problem().scan_map.to_world(before).center_world)
     prior = Prior(near=near, radius=1.0 + 0.5 * length - MAX_DISTANCE)
-    asked = replace(_query(), settings=replace(_query().settings, prior=prior))
-    assert estimate_errors(asked, pose).gaussian.pose.key == pose.key
+    told = estimate_errors(replace(_problem(), prior=prior), candidate, WORKERS)
+    assert told.gaussian.pose.key == pose.key
 
 
 def test_the_loss_is_that_of_the_averaged_pose():
-    query = _query()
+    problem = _problem()
     pose = step(_true_pose(), 0.5 * SMALL)
-    measured = judge.measure(query, Selection(Hypothesis(pose, 0.5), ()), None)
-    assert measured.pose.key == estimate_errors(query, pose).gaussian.pose.key != pose.key
-    points = visible_points(query.surroundings_at(pose)[0], measured.pose.center_world)
-    assert measured.loss == sampling_loss(points, query.colors(), measured.pose)
-    assert measured.loss < sampling_loss(points, query.colors(), pose)
+    candidate = examine(problem, pose)
+    measured = measure(problem, make_selection(candidate), None, WORKERS)
+    assert measured.pose.key == estimate_errors(problem, candidate, WORKERS).gaussian.pose.key != pose.key
+    points = visible_points(problem.surroundings_at(pose)[0], measured.pose.center_world)
+    assert measured.loss == sampling_loss(points, problem.colors(), measured.pose)
+    assert measured.loss < sampling_loss(points, problem.colors(), pose)
 
 
 def test_verification_is_the_same_bits_at_any_number_of_threads():
     poses = [_true_pose(), step(_true_pose(), SMALL), _moved((1.0, -0.8, 0.0))]
-    queries = _asked(1), _asked(2)
-    one, two = (q.workers.map(functools.partial(verification.verify, q), poses, "verify") for q in queries)
-    for a, b in zip(one, two, strict=True):
+    for pose in poses:
+        a, b = (_verify(pose, Workers(num_threads)) for num_threads in (1, 2))
         assert a.num_matches == b.num_matches
         assert a.pose.key == b.pose.key
 
 
-def test_the_scan_is_drawn_once_for_each_pose_of_the_grid(monkeypatch):
-    """At the grid's pose, wherever in its cell the pose lies; a masked photo is matched again."""
-    drawn = []
-
-    def match_drawn(query, pose):
-        drawn.append(pose)
-        return len(drawn)
-
-    monkeypatch.setattr(verification, "match_drawn", match_drawn)
-    query = _asked()
+def test_the_scan_is_drawn_once_for_each_pose_of_the_grid():
+    """At the grid's pose, wherever in its cell the pose lies."""
     middle = Pose(
         exp_so3(verification.TURN * np.array([3.0, -2.0, 8.0])),
         verification.PLACE * np.array([7.0, -4.0, 2.0]),
     )
+    known = Drawn(verification.round_pose(middle)[0], NO_MATCHES)
     for share in (0.0, 0.4, -0.4):
         turn = log_so3(middle.R_cam_from_world) + share * verification.TURN
         near = Pose(exp_so3(turn), middle.center_world + share * verification.PLACE)
-        assert verification.matches_near(query, near) == 1
-    assert len(drawn) == 1
-    np.testing.assert_allclose(drawn[0].center_world, middle.center_world, atol=1e-12)
-    np.testing.assert_allclose(drawn[0].R_cam_from_world, middle.R_cam_from_world, atol=1e-9)
+        drawn_at = verification.round_pose(near)[1]
+        np.testing.assert_allclose(drawn_at.center_world, middle.center_world, atol=1e-12)
+        np.testing.assert_allclose(drawn_at.R_cam_from_world, middle.R_cam_from_world, atol=1e-9)
+        assert verification.draw_near(_problem(), near, known, WORKERS) is known
     beside = Pose(middle.R_cam_from_world, middle.center_world + 0.6 * verification.PLACE)
-    assert verification.matches_near(query, beside) == 2
     turned = exp_so3(log_so3(middle.R_cam_from_world) + np.array([0.0, 0.6 * verification.TURN, 0.0]))
-    assert verification.matches_near(query, Pose(turned, middle.center_world)) == 3
-    masked = query.mask(np.zeros((8, 16), bool))
-    assert verification.matches_near(masked, middle) == 4
-    assert verification.matches_near(query, middle) == 1
+    for other in (beside, Pose(turned, middle.center_world)):
+        drawn = verification.draw_near(_problem(), other, known, WORKERS)
+        key, drawn_at = verification.round_pose(other)
+        assert drawn.key == key != known.key
+        expected = verification.match_drawn(_problem(), drawn_at, WORKERS)
+        np.testing.assert_array_equal(drawn.matches.points, expected.points)
 
 
 def test_matches_lie_on_the_scan_where_the_photo_sees_them():
     """At the true pose many rays lead to their points, and sizes and tangents are those of the photo."""
     true = _true_pose()
-    matches = verification.matches_near(_query(), true)
+    matches = _draw(true)
     offsets = matches.points - true.center_world
     distances = np.linalg.norm(offsets, axis=1)
     rays = offsets @ true.R_cam_from_world.T / distances[:, None]
@@ -271,38 +318,44 @@ def test_matches_lie_on_the_scan_where_the_photo_sees_them():
         ((0, 0, 0), 5.1, 0),
     ],
 )
-def test_matches_with_which_a_pose_moves_away_are_anothers(monkeypatch, offset, yaw_deg, expected):
+def test_matches_with_which_a_pose_moves_away_are_anothers(offset, yaw_deg, expected):
     """By 0.3 m or 5 degrees."""
     moved = _moved(offset, math.radians(yaw_deg))
-    monkeypatch.setattr(verification, "verify", lambda *_: verification.Verified(moved, 30))
-    assert verification.count_agreeing(_query(), _true_pose()) == expected
+    drawn = Drawn(verification.round_pose(_true_pose())[0], exact_matches(moved, 30))
+    candidate = replace(examine(_problem(), _true_pose()), drawn=drawn)
+    assert count_agreeing(_problem(), candidate, WORKERS).num_matches == expected
 
 
 @pytest.mark.parametrize("offset", [(0.0, -0.4, 0.0), (0.4, 0.4, 0.1), (-0.4, 0.2, 0.0)])
 def test_half_a_metre_off_the_matches_are_those_of_the_true_pose(offset):
     off = _moved(offset, math.radians(8.0))
-    found = verification.verify(_query(), off)
+    found = _verify(off)
     assert found.num_matches >= 12
     assert rooms.errors(found.pose, _true_pose())[0] < 0.1
-    assert verification.count_agreeing(_query(), off) == 0
+    assert _count(_problem(), off) == 0
 
 
-def test_the_scan_is_drawn_for_whole_photos_too_but_not_for_whole_views_alone(monkeypatch):
+def test_the_scan_is_drawn_for_whole_photos_too_but_not_for_whole_views_alone():
     whole = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
-    assert len(whole.photo.seen().views) == 4
-    assert verification.count_agreeing(whole, _true_pose()) > 20
-    assert verification.count_agreeing(whole, _moved((1.0, 0.5, 0.0))) < 6
-    monkeypatch.setattr(verification, "verify", lambda *_: pytest.fail("drawn"))
-    assert verification.count_agreeing(whole.by_views(), _true_pose()) == 0
+    assert len(whole.photo.seen(WORKERS).views) == 4
+    assert _count(whole, _true_pose()) > 20
+    assert _count(whole, _moved((1.0, 0.5, 0.0))) < 6
+    found = make_selection(examine(whole, _true_pose()))
+    workers, asked = rooms.listen()
+    assert complete(whole.by_views(), found, workers) is found
+    assert asked == []
+    complete(whole, found, workers)
+    assert "draw" in [label for label, _ in asked]
 
 
 @pytest.mark.parametrize(("count", "expected"), [(12, 2), (11, 6)])
-def test_a_pose_that_explains_less_than_half_of_a_sure_one_is_not_drawn(monkeypatch, count, expected):
-    monkeypatch.setattr(verification, "count_agreeing", lambda query, pose: count)
-    asked = _query()
-    best, *others = (Hypothesis(_true_pose(), score) for score in (0.8, 0.5, 0.4, 0.39, 0.3, 0.2, 0.1))
-    assert verification.list_rivals(asked, best, others) == others[:expected]
-    assert verification.list_rivals(asked.by_views(), best, others) == []
+def test_a_pose_that_explains_less_than_half_of_a_sure_one_is_not_drawn(count, expected):
+    """Of a whole photo, the scan is drawn at four others at most."""
+    scores = (0.8, 0.5, 0.4, 0.39, 0.3, 0.2, 0.1)
+    ranked = [make_candidate(k, score, count) for k, score in enumerate(scores)]
+    assert find_rivals(PARTIAL, ranked) == [k <= expected for k in range(7)]
+    assert find_rivals(WHOLE, ranked) == [k <= min(expected, 4) for k in range(7)]
+    assert find_rivals(PARTIAL.by_views(), ranked) == [False] * 7
 
 
 def test_the_least_distance_elsewhere_is_that_of_a_plain_search():

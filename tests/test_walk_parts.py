@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import rooms
+from piccolo.localization.settings import CoarseToFineSettings
 from pictures import encoded, write
 from refusals import assert_input_error
 from test_priors import write_photo
@@ -20,7 +21,6 @@ from piccolo.geometry.pose import Pose, exp_so3, log_so3
 from piccolo.geometry.pose_gaussian import PoseGaussian, probability_within
 from piccolo.judge.belief import make_belief
 from piccolo.judge.reasons import Reason
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.photo import Photo
 from piccolo.walk.frames import MOST_ODDS, Frame, State, list_states
 from piccolo.walk.path import Ranked

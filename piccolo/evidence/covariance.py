@@ -1,7 +1,7 @@
 """Covariance of a pose from blocks of the sphere."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -311,6 +311,13 @@ def compute_covariance(
         factor = few_blocks_factor(len(gradients)) if profile.is_partial else 1.0
         return steps.inflation * factor * covariance
 
+    return merge_images(by, profile, workers)
+
+
+def merge_images(
+    by: Callable[[DifferenceSteps], Array | None], profile: Profile, workers: Workers
+) -> Array | None:
+    """Merge the covariances by the finest images; if all are too rough, return that by the next one."""
     steps = SHAPE_STEPS if profile.has_shape else STEPS
     found = [c for c in workers.map(by, steps, "covariance") if c is not None]
     return merge_covariances(found) if found else by(ROUGH_SHAPE_STEPS if profile.has_shape else ROUGH_STEPS)

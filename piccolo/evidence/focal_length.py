@@ -151,7 +151,15 @@ def fit_focal(problem: Problem, best: Candidate, workers: Workers, is_first: boo
     near, far = descend_lens(problem, best, claim, starts, workers, is_first)
     by_matches = fit_matches(mount, best.pose, matches, FOCAL_WIDTHS)
     estimate = add_matches(estimate_lens(problem, best.pose, near), by_matches)
-    free = estimate_lens(problem, best.pose, far)
+    return weigh_claim(prior, camera, estimate, estimate_lens(problem, best.pose, far))
+
+
+def weigh_claim(prior: FocalPrior, camera: Camera, estimate: Estimate, free: Estimate) -> FocalFit:
+    """Weigh what was given of a camera against what the picture tells.
+
+    That is an estimate with the focal length free, and one with all corrections of the lens free.
+    """
+    claim = make_claim(prior, camera)
     values, information, motion = estimate
     off, variance = marginal(values, information, claim, FOCAL)
     off -= claim.expected[FOCAL]

@@ -97,12 +97,18 @@ def draw_near(problem: Problem, pose: Pose, known: Drawn | None, workers: Worker
 
     `known` are those near another pose: the same if it is near enough.
     """
+    key, drawn_at = round_pose(pose)
+    if known is not None and known.key == key:
+        return known
+    return Drawn(key, match_drawn(problem, drawn_at, workers))
+
+
+def round_pose(pose: Pose) -> tuple[bytes, Pose]:
+    """Return the nearest pose of the grid on which the scan is drawn, and its key."""
     place = np.rint(pose.center_world / PLACE)
     turn = np.rint(log_so3(pose.R_cam_from_world) / TURN)
     key = np.concatenate([place, turn]).astype(np.int64).tobytes()
-    if known is not None and known.key == key:
-        return known
-    return Drawn(key, match_drawn(problem, Pose(exp_so3(turn * TURN), place * PLACE), workers))
+    return key, Pose(exp_so3(turn * TURN), place * PLACE)
 
 
 def match_drawn(problem: Problem, pose: Pose, workers: Workers) -> Matches:

@@ -59,8 +59,14 @@ def check_memory(num_bytes: float, purpose: str, advice: str) -> None:
 
 def memory_left() -> float:
     """Bytes that this process may still take: of the user's limit, or a part of what is free."""
-    free = min(float(psutil.virtual_memory().available), free_of_cgroup(), free_of_process())
-    return min(LIMIT[0] - memory_taken(), free) if LIMIT else DEFAULT_FRACTION * free
+    free_of_containers = free_of_cgroup(OWN_CGROUPS, CGROUPS)
+    free = min(float(psutil.virtual_memory().available), free_of_containers, free_of_process())
+    return share_free(free, memory_taken(), LIMIT[0] if LIMIT else None)
+
+
+def share_free(free: float, taken: float, limit: float | None) -> float:
+    """Return what a process that has taken some bytes may still take: of its limit, or a part of the rest."""
+    return DEFAULT_FRACTION * free if limit is None else min(limit - taken, free)
 
 
 def memory_taken() -> float:
@@ -100,20 +106,23 @@ def free_of_process() -> float:
     return limit if limit == float("inf") else limit - this_process().memory_info().vms
 
 
-def free_of_cgroup() -> float:
-    """Bytes that the limits of this process's containers leave, caches not counted; infinite without."""
-    return min(_free_of_cgroups(), default=float("inf"))
+def free_of_cgroup(own: Path, cgroups: Path) -> float:
+    """Bytes that the limits of containers leave, caches not counted; infinite without.
+
+    The file `own` names those of this process, whose limits lie in the folder `cgroups`.
+    """
+    return min(_free_of_cgroups(own, cgroups), default=float("inf"))
 
 
-def _free_of_cgroups() -> Iterator[float]:
+def _free_of_cgroups(own: Path, cgroups: Path) -> Iterator[float]:
     """Bytes that each limited cgroup leaves, of version 2 and 1, from this process's own up to the root."""
-    for line in _text(OWN_CGROUPS).splitlines():
+    for line in _text(own).splitlines():
         _, controllers, path = line.split(":", 2)
         if controllers and "memory" not in controllers.split(","):
             continue
         root, limit, usage, cache = V1 if controllers else V2
-        folder = CGROUPS / root / path.lstrip("/")
-        while folder.is_relative_to(CGROUPS / root):
+        folder = cgroups / root / path.lstrip("/")
+        while folder.is_relative_to(cgroups / root):
             most = _text(folder / limit).strip()
             used = _text(folder / usage).strip()
             if most.isdigit() and used.isdigit():

@@ -92,7 +92,12 @@ def look_first(problem: Problem, known: list[Candidate], means: Means) -> tuple[
             found = known + refine_starts(problem, starts, FIRST_BEAM, workers)
             if not is_clear(problem.profile, choose_among(problem, found, workers)):
                 return found, False
-            return found, score_starts(problem, starts, workers) >= MIRROR_RATIO * of_mirror()
+            return found, beats_mirror(score_starts(problem, starts, workers), of_mirror())
+
+
+def beats_mirror(own: float, mirrored: float) -> bool:
+    """Return True if first scores tell a photo from its mirror image."""
+    return own >= MIRROR_RATIO * mirrored
 
 
 def draw_found(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:

@@ -1,5 +1,6 @@
 """Copies of a place, as rooms of one kind: poses elsewhere at which the scan looks the same."""
 
+from collections.abc import Sequence
 from itertools import compress
 
 from ..confidence.alternatives import MAX_ALTERNATIVES, suppress_near
@@ -7,7 +8,7 @@ from ..evidence.examine import complete, examine_each
 from ..evidence.verification import find_copies
 from ..geometry.nearness import ONE_ANSWER
 from ..jobs.threads import Workers
-from ..judge.candidate import Selection
+from ..judge.candidate import Candidate, Selection
 from ..judge.selection import find_rivals
 from ..problem.problem import Problem
 from ..problem.settings import Effort
@@ -19,16 +20,21 @@ def list_reported(
 ) -> tuple[Selection, list[bool]]:
     """Return the selection with the alternatives to report; True for poses that are copies, the best first.
 
-    In a scan without colours copies are searched. They are reported before other poses.
+    In a scan without colours copies are searched.
     """
     if not problem.profile.has_shape:
         reported = found.take(found.ranked[: 1 + MAX_ALTERNATIVES])
         return reported, list_copies(problem, reported, workers)
     alike = find_alike(problem, found.best.pose, effort, workers)
-    copies = examine_each(problem, alike, workers)
+    reported, is_copy = put_first(found, examine_each(problem, alike, workers))
+    return complete(problem, reported, workers), is_copy
+
+
+def put_first(found: Selection, copies: Sequence[Candidate]) -> tuple[Selection, list[bool]]:
+    """Return the selection with copies of its place before other poses; True for them and the best."""
     others = suppress_near([*copies, *found.alternatives], MAX_ALTERNATIVES, ONE_ANSWER)
-    reported = complete(problem, found.take([found.best, *others]), workers)
-    return reported, [True, *(k < len(copies) for k in range(len(others)))]
+    is_copy = [any(other is copy for copy in copies) for other in others]
+    return found.take([found.best, *others]), [True, *is_copy]
 
 
 def list_copies(problem: Problem, found: Selection, workers: Workers) -> list[bool]:

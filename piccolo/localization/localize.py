@@ -91,18 +91,25 @@ def find(problem: Problem, scan_map: ScanMap, means: Means) -> Found:
     workers = means.workers
     # idle cores prepare the images that later steps need
     with workers.beside(images.middle, images.fine, images.full, problem.colors):
-        candidates: list[Candidate] = []
-        asked = problem
-        for asked, attempt in plan_attempts(problem):
-            candidates, is_enough = attempt(asked, candidates, means)
-            means.trace.note("attempt", partial(describe_attempt, asked, attempt, candidates, is_enough))
-            if is_enough:
-                break
+        asked, candidates = make_attempts(plan_attempts(problem), means)
         candidates += search_beyond_prior(asked, scan_map, means)
         with means.watch.stage("refine"):
             refined = refine_best(asked, candidates, workers)
             means.trace.note("refined", partial(describe_selection, asked, refined))
             return fit_camera(asked, refined, means)
+
+
+def make_attempts(
+    planned: Sequence[tuple[Problem, Attempt]], means: Means
+) -> tuple[Problem, list[Candidate]]:
+    """Make attempts until one is sure; return the problem of the last one, and what all have found."""
+    candidates: list[Candidate] = []
+    for asked, attempt in planned:
+        candidates, is_enough = attempt(asked, candidates, means)
+        means.trace.note("attempt", partial(describe_attempt, asked, attempt, candidates, is_enough))
+        if is_enough:
+            break
+    return asked, candidates
 
 
 def describe_attempt(

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..arrays import Array
 from ..evidence.examine import count_agreeing
 from ..geometry.pose import Pose, uniform_yaws
 from ..jobs.threads import Workers
@@ -50,13 +51,23 @@ def search_mirrored(
         keypoints = join_features(problem, workers)[0]
         matches = match(keypoints.mirror(), problem.scan_map.features_now(workers), workers)
         return refine_matches(mirrored, [f.pose for f in propose_poses(matches, 1, workers)], workers)
-    yaws = uniform_yaws(effort.num_yaws)
-    tilt = ACROSS @ pose.R_cam_from_world @ ACROSS
-    asked = replace(mirrored, rotations=tilt @ np.concatenate([yaws, UPSIDE_DOWN @ yaws]))
-    own = replace(problem, rotations=pose.R_cam_from_world @ yaws)
+    asked = replace(mirrored, rotations=list_mirrored(pose.R_cam_from_world, effort.num_yaws))
+    own = replace(problem, rotations=pose.R_cam_from_world @ uniform_yaws(effort.num_yaws))
     own_score = score_near(problem, pose, workers)
-    if score_briefly(own, effort.brief(), workers) < FOUND_AGAIN * own_score:
+    if not is_found_again(score_briefly(own, effort.brief(), workers), own_score):
         starts = search_poses(asked, "known", effort, workers)
         return refine_starts(asked, starts, problem.profile.beam, workers)
     ends = descend_briefly(asked, effort.brief(), workers)
     return refine_starts(asked, ends.poses, FIRST_BEAM, workers) if ends.best_score > own_score else []
+
+
+def list_mirrored(R_cam_from_map: Array, num_yaws: int) -> Array:
+    """Return rotations (2 N, 3, 3) of a mirrored photo: at the tilt of a pose, and at that upside down."""
+    yaws = uniform_yaws(num_yaws)
+    tilt = ACROSS @ R_cam_from_map @ ACROSS
+    return np.asarray(tilt @ np.concatenate([yaws, UPSIDE_DOWN @ yaws]))
+
+
+def is_found_again(brief_score: float, own_score: float) -> bool:
+    """Return True if a brief search finds about the score that a photo has at its own pose."""
+    return brief_score >= FOUND_AGAIN * own_score

@@ -28,9 +28,10 @@ from ..judge.belief import make_belief
 from ..judge.conclude import take_pose
 from ..judge.reasons import explain
 from ..problem.problem import Problem
+from .expectation import Expected, Followed
 from .frames import Frame
 from .path import EVEN, Gap, Path, Ranked, believe, build_lattice
-from .tracker import Expected, Followed, Tracker, find_near, refine_state
+from .tracker import Tracker, find_near, refine_state
 
 LEAST_WALKED = 2.0  # [m] between frames by which an odometry is checked
 LEAST_RATIOS = 4  # of distances; fewer say nothing

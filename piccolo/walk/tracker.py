@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import compress
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from ..confidence.confidence import MODELS, Standing, pose_features, posterior
 from ..evidence.examine import complete, examine
 from ..evidence.verification import draw_near, match_beside, place_keypoints, verify
 from ..geometry.nearness import ONE_ANSWER, ONE_PLACE, non_maximum_suppression
-from ..geometry.pose import Pose, carry, exp_so3, log_so3, uniform_yaws
+from ..geometry.pose import Pose, uniform_yaws
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.candidate import Selection
 from ..judge.selection import assess
@@ -21,19 +20,28 @@ from ..localization.attempts import is_whole
 from ..localization.beam import Ends, descend_briefly, score_briefly, score_mirror, score_near
 from ..localization.localize import localize
 from ..localization.means import Means
-from ..localization.near import refine_near
+from ..localization.near import Near, refine_near
 from ..panorama import Panorama
 from ..problem.prior import apply_prior
 from ..problem.problem import Problem, prepare_problem
 from ..problem.settings import CoarseToFineSettings, Effort
 from ..scan_map.camera_positions import FreeSpace
 from ..scan_map.scan_map import ScanMap
+from .expectation import (
+    Expected,
+    Followed,
+    Place,
+    describe_end,
+    expect,
+    is_acceptable,
+    list_alike,
+    list_starts,
+)
 from .frames import (
     MOST_EXPECTED,
     MOST_ODDS,
     REACH_SLACK,
     Frame,
-    How,
     Motion,
     State,
     list_states,
@@ -42,29 +50,12 @@ from .frames import (
 )
 from .path import COPY_LOG_ODDS, EVEN, Lattice
 
-Place = tuple[Pose, float]  # in the map, as rough as the grid of candidates; log odds against the frame's own
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
 LEAST_SCORE = 0.05  # of a tracked pose: with less it explains nothing
 NUM_KEPT = 4  # problems, of the frames that were asked for last
 BETWEEN_KEYS = ONE_PLACE.distance  # [m] key frames are so far apart
 MOST_PLACES = 64  # of a frame: the rooms of a hotel that look alike
 ELSEWHERE = ONE_PLACE.distance + 2.0 * REACH_SLACK  # [m] reach beyond which a camera may be at another place
-
-
-class Expected(NamedTuple):
-    """The pose that a frame is expected to have, from the pose of another, and its limits."""
-
-    last: Pose  # of the other frame, moved by the odometry if there is one
-    reach: float  # [m] from there
-    pose: Pose  # predicted
-
-
-class Followed(NamedTuple):
-    """The pose of a frame that was found from another's."""
-
-    state: State
-    how: How
-    is_alone: bool  # False if it may be at another place within reach
 
 
 class Tracker:
@@ -269,32 +260,6 @@ def refine_state(problem: Problem, states: Sequence[State], rough: State, worker
     return put_state(others, replace(end, log_odds=best.log_odds + log_ratio(float(second), float(first))))
 
 
-def expect(frame: Frame, near: Sequence[tuple[Frame, Pose]], motion: Motion) -> Expected:
-    """Predict where a frame is from others, the last of them first: by odometry or at constant velocity."""
-    before, last = near[0]
-    seconds = frame.time - before.time
-    reach = motion.reach(seconds)
-    if frame.odometry is not None and before.odometry is not None:
-        moved = carry(frame.odometry, before.odometry, last)
-        return Expected(moved, reach, moved)
-    if len(near) == 1:
-        return Expected(last, reach, last)
-    earlier, pose = near[1]
-    return Expected(last, reach, predict(last, pose, seconds / (before.time - earlier.time), reach))
-
-
-def predict(last: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pose:
-    """Predict a camera's pose at constant velocity from an earlier pose and the last.
-
-    `ratio` is the time since the last pose divided by the time between the two. The prediction is at most
-    `max_distance` [m] away.
-    """
-    move = ratio * (last.center_world - earlier.center_world)
-    move *= min(1.0, max_distance / max(float(np.linalg.norm(move)), 1e-9))
-    turn = ratio * log_so3(last.R_cam_from_world @ earlier.R_cam_from_world.T)
-    return Pose(exp_so3(turn) @ last.R_cam_from_world, last.center_world + move)
-
-
 def find_near(problem: Problem, expected: Expected, means: Means) -> Followed | None:
     """Track a frame from the expected pose, if that looks hardly worse than the best place within reach.
 
@@ -310,21 +275,13 @@ def find_near(problem: Problem, expected: Expected, means: Means) -> Followed | 
         return None
     score = score_near(problem, expected.pose, workers)
     best_score = max(ends.best_score, score)
-    is_alike = log_behind(problem, score, best_score) > -COPY_LOG_ODDS
-    places = [pose for pose, behind in list_places(problem, ends, best_score) if behind > -COPY_LOG_ODDS]
-    alike = [pose for pose in places if pose.distance(expected.last) <= expected.reach]
-    starts = [expected.pose, *alike[:1]] if is_alike else alike[:1]
-    found = (track(problem, start, workers) for start in starts)
-    end = next((state for state in found if state is not None and is_acceptable(state, expected)), None)
-    if end is None and not is_alike and problem.profile.is_narrow:
-        last = track(problem, expected.pose, workers)
-        is_sure = last is not None and last.log_odds >= SURE_ODDS and is_acceptable(last, expected)
-        end = last if is_sure else None
-    if end is None:
-        return None
-    how: How = "tracked" if ONE_PLACE.holds(end.pose, expected.pose) else "near"
-    state = replace(end, gain=compute_gain(problem, near))
-    return Followed(state, how, all(ONE_PLACE.holds(pose, end.pose) for pose in alike))
+    behind = log_behind(problem, score, best_score)
+    alike = list_alike(expected, list_places(problem, ends, best_score))
+    for start in list_starts(expected, behind, alike, problem.profile.is_narrow):
+        end = track(problem, start.pose, workers)
+        if end is not None and is_acceptable(end, expected, start.must_be_sure):
+            return describe_end(replace(end, gain=compute_gain(problem, near)), expected, alike)
+    return None
 
 
 def compute_gain(problem: Problem, near: Problem) -> float:
@@ -334,12 +291,6 @@ def compute_gain(problem: Problem, near: Problem) -> float:
     """
     share = len(near.scan_map.sparse) / len(problem.scan_map.sparse)
     return 0.0 if problem.profile.is_partial else min(-math.log(share), MOST_EXPECTED)
-
-
-def is_acceptable(state: State, expected: Expected) -> bool:
-    """Return True for a pose within reach that is where it was expected, or sure by itself."""
-    is_sure = state.log_odds >= SURE_ODDS or ONE_PLACE.holds(state.pose, expected.pose)
-    return is_sure and state.pose.distance(expected.last) <= expected.reach
 
 
 def track(problem: Problem, start: Pose, workers: Workers) -> State | None:
@@ -352,6 +303,11 @@ def track(problem: Problem, start: Pose, workers: Workers) -> State | None:
         first = ends[0].end
         drawn = draw_near(problem, first.pose, first.drawn, workers).matches
         ends.append(refine_near(problem, verify(problem, first.pose, drawn).pose, workers))
+    return choose_end(ends)
+
+
+def choose_end(ends: Sequence[Near]) -> State | None:
+    """Return the likeliest end; None if it more likely is wrong than right, or explains nothing."""
     odds = [log_ratio(near.place, 1.0 - near.place) for near in ends]
     best = int(np.argmax(odds))
     end, gaussian, _ = ends[best]
