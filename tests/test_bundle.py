@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rooms
-from made_up import PROBLEM, at
+from made_up import PROBLEM, at, make_candidate
 from poses import tilted_poses
 
 from piccolo.confidence.localization import Alternative, Localization
@@ -24,8 +24,8 @@ from piccolo.localization.bundle import (
     NOT_FOUND,
     UNSEEN,
     compare_errors,
+    judge_member,
     localize_bundle,
-    place_member,
 )
 from piccolo.localization.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
 from piccolo.localization.judging import Found
@@ -132,7 +132,7 @@ def test_what_a_photo_rules_out_stays_so_unless_others_know_its_focal_length(con
     assert member.is_misplaced == (conflict == 5.0 and is_measured)
     if not member.is_misplaced:
         agreed = SimpleNamespace(warnings=("scale",))
-        result = place_member(member, 0, SURE, agreed, np.array([1.0, 0.0]))
+        result = judge_member(member, 0, SURE, 0.9, agreed, [], np.array([1.0, 0.0]), rooms.means())
         assert result == replace(alone, warnings=("mirrored", "scale"))
 
 
