@@ -1,12 +1,12 @@
 # The public names: type checkers read them here, and at run time each is imported from here at its first use.
-from .confidence.covariance import PoseCovariance as PoseCovariance
-from .confidence.localization import (
+from .errors import InputError as InputError
+from .geometry.pose import Pose as Pose
+from .judge.localization import (
     Alternative as Alternative,
     Evidence as Evidence,
     FocalLength as FocalLength,
 )
-from .errors import InputError as InputError
-from .geometry.pose import Pose as Pose
+from .judge.pose_covariance import PoseCovariance as PoseCovariance
 from .opening import Cloud as Cloud, open_scan as open_scan
 from .paper.localize import PaperSettings as PaperSettings
 from .photo import GpsPrior as GpsPrior, Photo as Photo, Prior as Prior

@@ -123,3 +123,9 @@ def check_one_each(name: str, values: Sized | None, count: int, what: str) -> No
     """Refuse an argument that is not a value of each of several photos."""
     if values is not None and len(values) != count:
         raise InputError(f"`{name}`: found {len(values)} of {count} {what}s, wanted one of each {what}")
+
+
+def check_confidence(min_confidence: float) -> None:
+    """Refuse a threshold that no confidence can pass or fail."""
+    if not 0.0 < min_confidence < 1.0:
+        raise InputError(f"`min_confidence`: found {min_confidence}, wanted above 0 and below 1")

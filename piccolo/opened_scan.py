@@ -10,21 +10,22 @@ import numpy as np
 from .arrays import Bytes
 from .camera import Calibration
 from .cloud.settings import CloudSettings, from_wgs84
-from .confidence.confidence import LOCALIZED, NOT_LOCALIZED
-from .confidence.localization import FocalLength, Localization
-from .confidence.occlusion import occlusion_mask
 from .errors import InputError, is_passing
+from .evidence.occlusion import occlusion_mask
 from .files.json_file import reading_once
 from .geometry.colors import Labels
 from .geometry.nearness import CONFIRMED
 from .geometry.pose import Pose, check_pose
 from .jobs.memory import check_memory
 from .jobs.threads import Stopwatch, Workers
+from .judge.localization import FocalLength, Localization
+from .judge.probability import LOCALIZED, NOT_LOCALIZED
 from .localization.beside import SurePhoto, localize_beside, place_sure
 from .localization.bundle import localize_bundle
 from .localization.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
 from .localization.localize import has_guessed_focal, localize, localize_guessed
 from .localization.means import NO_TRACE, Trace
+from .localization.places import add_places
 from .panorama import Panorama, check_labels, read_panorama
 from .panorama.photo import PhotoFacts, read_photo_facts, sha256_of
 from .paper.localize import PaperMap, PaperSettings, localize as localize_by_paper
@@ -32,7 +33,7 @@ from .photo import GpsPrior, Photo, Prior
 from .problem.problem import prepare_problem
 from .problem.settings import CoarseToFineSettings
 from .result import Result, Source, describe_failure, unreadable_result, with_localization
-from .scan_map.scan_map import ScanMap, add_places, check_within
+from .scan_map.scan_map import ScanMap, check_within
 
 LABELS_WARNING = "`labels`: the confidence was fitted to colours; with labels it is a rough estimate"
 MEMORY_OF_PHOTO = 8e7  # [byte] that a photo keeps while others of its bundle are localized

@@ -15,15 +15,15 @@ from . import __version__
 from .arrays import Array
 from .camera import Mount
 from .camera.calibration import document_of as camera_document, read_mounts
-from .confidence.confidence import AMBIGUOUS, LOCALIZED
-from .confidence.covariance import PoseCovariance
-from .confidence.localization import Alternative, Evidence, FocalLength, Localization, SphereGeometry
 from .errors import UNPRINTABLE, InputError, printable, text_of
 from .files.json_file import document_of, parse_lines, read_bytes
 from .geometry.pose import Pose, check_pose, heading_pitch_roll_deg
 from .geometry.sphere import CONVENTION
 from .jobs.memory import is_shortage
 from .judge.belief import NOTHING, Belief
+from .judge.localization import Alternative, Evidence, FocalLength, Localization, SphereGeometry
+from .judge.pose_covariance import PoseCovariance
+from .judge.probability import AMBIGUOUS, LOCALIZED
 from .photo import GpsPrior
 from .walk.results import WalkFrame
 

@@ -9,18 +9,19 @@ import numpy as np
 from . import __version__
 from .arguments import check_kind
 from .arrays import Bytes
-from .confidence.localization import Localization
 from .errors import InputError
 from .files.json_file import reading_once
 from .geometry.pose import Pose, check_pose
 from .jobs.threads import Progress, Stopwatch, Workers, no_progress
+from .judge.localization import Localization
+from .localization.places import add_places
 from .opened_scan import OpenedScan, Settings, make_failed_result, settings_json
 from .panorama import Panorama
 from .panorama.photo import read_photo_facts, sha256_of
 from .photo import File, Photo, as_photo
 from .problem.problem import Problem
 from .result import Result, with_localization
-from .scan_map.scan_map import add_places, check_within
+from .scan_map.scan_map import check_within
 from .walk.frames import Frame, Motion, check_times
 from .walk.path import believe
 from .walk.results import WalkFrame, describe_frame, make_localization, make_localizations

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, yaw_rotation
+from piccolo.judge.alternatives import Hypothesis
 from piccolo.judge.candidate import Candidate, Comparison, Selection
 from piccolo.local_features.matching import Matches
 from piccolo.optimize.channel_loss import CHANCE

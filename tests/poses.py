@@ -5,9 +5,9 @@ import json
 import cv2
 import numpy as np
 
-from piccolo.confidence.localization import Evidence
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.sphere import pixel_rays
+from piccolo.judge.localization import Evidence
 from piccolo.result import Result
 
 WIDTH = 512

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from piccolo.confidence.covariance import PoseCovariance
-from piccolo.confidence.localization import Alternative, Evidence
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
+from piccolo.judge.localization import Alternative, Evidence
+from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.result import Result, Source, unreadable_result
 from piccolo.views.pictures import encode_image
 from piccolo.walk.path import Gap

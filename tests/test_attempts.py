@@ -9,13 +9,13 @@ import pytest
 import rooms
 from made_up import PARTIAL, PROBLEM, WHOLE, exact_matches, make_candidate, make_selection, places
 
-from piccolo.confidence.confidence import LOCALIZED
 from piccolo.evidence.examine import examine
 from piccolo.evidence.verification import round_pose
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import Pose, exp_so3, step
 from piccolo.jobs.threads import Once, Stopwatch, Workers
 from piccolo.judge.candidate import Drawn
+from piccolo.judge.probability import LOCALIZED
 from piccolo.judge.selection import is_clear
 from piccolo.local_features.keypoints import join_keypoints
 from piccolo.local_features.matching import NO_MATCHES

@@ -26,12 +26,12 @@ from piccolo.camera.calibration import document_of
 from piccolo.camera.model import pinhole
 from piccolo.cli import localize
 from piccolo.cloud.settings import CloudSettings
-from piccolo.confidence.covariance import describe_errors
-from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
+from piccolo.judge.localization import Localization
+from piccolo.judge.pose_covariance import describe_errors
 from piccolo.opened_scan import OpenedScan
 from piccolo.photo import Photo
 from piccolo.result import Beside, Result, Source, read_results

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from piccolo.confidence.localization import Alternative, Evidence, Localization
 from piccolo.geometry.pose import Pose
 from piccolo.judge.belief import NOTHING, decide, make_belief
+from piccolo.judge.localization import Alternative, Evidence, Localization
 from piccolo.judge.reasons import WORDS, Contradiction, Reason, explain
 from piccolo.judge.together import Shares, believe_beside, believe_together, share_place
 from piccolo.paper.localize import believe as believe_by_paper

@@ -8,7 +8,6 @@ import pytest
 import rooms
 from test_verification import NUM_POINTS, _beside, _narrow, _problem, _true_pose
 
-from piccolo.confidence.localization import Localization
 from piccolo.evidence import verification
 from piccolo.evidence.focal_length import FocalFit
 from piccolo.geometry.pose import Pose
@@ -16,6 +15,7 @@ from piccolo.geometry.pose_gaussian import LIKELY, PoseGaussian, subtract
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import NOTHING
+from piccolo.judge.localization import Localization
 from piccolo.judge.reasons import Reason
 from piccolo.local_features.hypotheses import exact_pose
 from piccolo.local_features.matching import NO_MATCHES

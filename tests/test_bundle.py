@@ -11,12 +11,12 @@ import rooms
 from made_up import PROBLEM, at, make_candidate
 from poses import tilted_poses
 
-from piccolo.confidence.localization import Alternative, Localization
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import Selection
+from piccolo.judge.localization import Alternative, Localization
 from piccolo.judge.reasons import Reason
 from piccolo.localization import bundle_search
 from piccolo.localization.bundle import (

@@ -28,11 +28,11 @@ from piccolo.coloring.color_scan import (
     make_brushes,
     paint_points,
 )
-from piccolo.confidence.covariance import PoseCovariance
 from piccolo.errors import InputError, ResourceError
 from piccolo.files.line_file import Journal
 from piccolo.geometry.pose import Pose, pose_errors, step
 from piccolo.jobs.threads import Workers
+from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.panorama import Panorama
 from piccolo.result import Result
 from piccolo.scan_map.scan_map import prepare_map

@@ -7,14 +7,14 @@ from made_up import at
 from piccolo.localization.settings import CoarseToFineSettings
 from rooms import as_panorama
 
-from piccolo.confidence import alternatives, confidence as rule
-from piccolo.confidence.confidence import Standing, classify, posterior
-from piccolo.confidence.covariance import PoseCovariance, least_constrained_direction
-from piccolo.confidence.occlusion import Agreement, measure_agreement
 from piccolo.errors import InputError
+from piccolo.evidence.occlusion import Agreement, measure_agreement
 from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose import exp_so3, step
+from piccolo.judge import alternatives, probability as rule
 from piccolo.judge.belief import make_belief
+from piccolo.judge.pose_covariance import PoseCovariance, least_constrained_direction
+from piccolo.judge.probability import Standing, classify, posterior
 from piccolo.paper.localize import PaperSettings
 
 SURE = 0.002  # [m] largest deviation

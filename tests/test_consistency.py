@@ -8,10 +8,10 @@ import pytest
 from consistency import contradictions_of_line, find_contradictions, lines_of_results
 from test_result import POSE, RESULT
 
-from piccolo.confidence.covariance import PoseCovariance
-from piccolo.confidence.localization import Alternative, FocalLength
 from piccolo.geometry.pose import Pose
 from piccolo.judge.belief import make_belief
+from piccolo.judge.localization import Alternative, FocalLength
+from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.walk.results import WalkFrame
 
 SETTINGS = {"preset": "default", "cloud": {}, "panorama": {}}

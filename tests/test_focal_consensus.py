@@ -15,12 +15,12 @@ from piccolo.batch.localizer import list_changed_by_consensus, list_looks_by_foc
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli.localize import main
-from piccolo.confidence.focal_length import WRONG_SHARE, Consensus, Opinion
-from piccolo.confidence.localization import FocalLength, Localization
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.conclude import follow_consensus
+from piccolo.judge.consensus import WRONG_SHARE, Consensus, Opinion
+from piccolo.judge.localization import FocalLength, Localization
 from piccolo.judge.reasons import Reason
 from piccolo.result import Result, Source, read_results
 from research.synthetic.world import render_picture

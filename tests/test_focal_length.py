@@ -13,7 +13,6 @@ import piccolo
 from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.camera.resampling import View, make_sphere
-from piccolo.confidence.localization import Alternative, Evidence, FocalLength, Localization
 from piccolo.evidence import focal_length as focal
 from piccolo.evidence.examine import examine
 from piccolo.evidence.lens_matches import fit_matches
@@ -22,6 +21,7 @@ from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import Selection
+from piccolo.judge.localization import Alternative, Evidence, FocalLength, Localization
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import localize as module
 from piccolo.localization.calibration import follow_matches, recalibrate

@@ -32,14 +32,14 @@ LAYERS = [
     "result",
     "walk",
     "localization",
+    "paper",
+    "evidence",
+    "judge",
+    "problem",
     "scan_map",
     "local_features",
-    "paper",
     "gravity",
     "optimize",
-    "confidence.localization",  # until results have a room
-    "judge",
-    "confidence",
     "views",
     "panorama",
     "photo",
@@ -138,7 +138,7 @@ def test_one_module_makes_statuses():
         return {path for path, node in calls if node.func.id == name}
 
     assert find_callers("classify") == {"judge/belief.py"}
-    assert find_callers("decide") == {"confidence/localization.py"}
+    assert find_callers("decide") == {"judge/localization.py"}
     results = [node for _, node in calls if node.func.id == "Localization"]
     assert len(results) > 5
     assert not any(node.args or "status" in [k.arg for k in node.keywords] for node in results)

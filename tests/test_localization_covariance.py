@@ -13,13 +13,13 @@ from rooms import WORKERS, as_panorama, errors, query
 
 from piccolo.cloud.readers.reader import PointSource, RawCloud
 from piccolo.cloud.stream import CloudStream
-from piccolo.confidence.covariance import describe_errors
 from piccolo.evidence import covariance
 from piccolo.evidence.examine import examine
 from piccolo.geometry.pose import Pose, exp_so3, step, yaw_rotation
 from piccolo.geometry.sphere import compute_pixels, pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.judge.candidate import Selection, Unoccluded
+from piccolo.judge.pose_covariance import describe_errors
 from piccolo.localization.calibration import calibrate_sphere
 from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.panorama import Panorama

@@ -21,8 +21,8 @@ from test_result import RESULT
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli import execution, localize, prepare_map
-from piccolo.confidence.localization import FocalLength
 from piccolo.judge.belief import make_belief
+from piccolo.judge.localization import FocalLength
 from piccolo.judge.reasons import Reason
 from piccolo.result import Result
 from research.scene import read_scene

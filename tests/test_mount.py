@@ -17,7 +17,6 @@ from piccolo.batch.pose_table import read_pose_table
 from piccolo.batch.relative_poses import read_relative_poses
 from piccolo.cli import calibrate_mount, e57_images
 from piccolo.cloud.readers.e57 import read_image
-from piccolo.confidence.covariance import PoseCovariance
 from piccolo.geometry.pose import (
     Pose,
     angle_between,
@@ -27,6 +26,7 @@ from piccolo.geometry.pose import (
     yaw_rotation,
 )
 from piccolo.geometry.pose_gaussian import add, subtract
+from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.photo import Prior
 
 ORIGIN = np.array([500_000.0, 5_400_000.0, 300.0])

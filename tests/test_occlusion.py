@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import rooms
 
-from piccolo.confidence import occlusion
+from piccolo.evidence import occlusion
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.sphere import pixel_rays, solid_angles
 from piccolo.panorama import Panorama

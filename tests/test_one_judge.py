@@ -13,12 +13,12 @@ from test_walk import _walk_through
 import piccolo
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
-from piccolo.confidence.confidence import Standing
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.case import UNKNOWN_ERRORS, Case, Geometry, Measured
 from piccolo.judge.conclude import MIRRORED, NOT_AS_CLAIMED
+from piccolo.judge.probability import Standing
 from piccolo.judge.reasons import Reason
 from piccolo.localization import judging
 from research.synthetic.world import photograph, render_picture

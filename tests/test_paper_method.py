@@ -10,9 +10,9 @@ from refusals import assert_input_error
 from rooms import as_panorama, errors, query, room
 
 from piccolo.cloud.soa import pack_points
-from piccolo.confidence.localization import Evidence
 from piccolo.geometry.pose import Pose, uniform_rotations
 from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.judge.localization import Evidence
 from piccolo.panorama.model import shrink
 from piccolo.paper.localize import (
     MIN_CLEARANCE,

@@ -23,10 +23,10 @@ from poses import result, write_results
 from piccolo.cli.command import new_parser, parse
 from piccolo.cloud.readers.e57 import list_images
 from piccolo.cloud.writers import vertex_rows
-from piccolo.confidence.covariance import PoseCovariance
 from piccolo.export.formats import export, tum_lines
 from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
+from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.result import read_results
 
 RECIPES = sorted((ROOT / "docs" / "recipes").glob("*.md"))

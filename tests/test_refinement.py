@@ -9,13 +9,13 @@ import pytest
 import rooms
 from made_up import PARTIAL, PROBLEM, WHOLE, at, make_candidate, move, place
 
-from piccolo.confidence.alternatives import Hypothesis
 from piccolo.evidence.examine import examine
 from piccolo.geometry.cone import EVERYWHERE
 from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose import Pose, step
 from piccolo.geometry.sphere import make_grid
 from piccolo.jobs.threads import Workers
+from piccolo.judge.alternatives import Hypothesis
 from piccolo.judge.candidate import CONTRADICTS, Comparison
 from piccolo.localization import beam, ladder
 from piccolo.localization.beam import best_and_alternatives, narrow

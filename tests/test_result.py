@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from refusals import assert_input_error
 
-from piccolo.confidence.covariance import PoseCovariance
-from piccolo.confidence.localization import Alternative, Evidence
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.judge.belief import make_belief
+from piccolo.judge.localization import Alternative, Evidence
+from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.judge.reasons import Reason
 from piccolo.report.site import NOT_TOLD
 from piccolo.result import Result, Source, read_results, unreadable_result

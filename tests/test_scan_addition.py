@@ -18,12 +18,13 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization.localize import localize
+from piccolo.localization.places import add_places
 from piccolo.photo import Prior
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.scan_map.camera_positions import MIN_CLEARANCE
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_addition import add_scan
-from piccolo.scan_map.scan_map import add_places, find_scan_at, name_scan, prepare_map
+from piccolo.scan_map.scan_map import find_scan_at, name_scan, prepare_map
 from piccolo.views.candidate_views import SEARCH_VIEW, WideViews, render_wide
 
 BESIDE = np.array([5.3, 0.4, 0.2])  # of a second room, from where it was made [m]

@@ -8,12 +8,12 @@ import pytest
 import rooms
 from made_up import PROBLEM, WHOLE, make_candidate, make_selection, place, places
 
-from piccolo.confidence.confidence import Standing
-from piccolo.confidence.localization import Localization
 from piccolo.evidence.examine import count_agreeing, examine
 from piccolo.geometry.pose import step
 from piccolo.jobs.threads import Workers
 from piccolo.judge.candidate import Selection
+from piccolo.judge.localization import Localization
+from piccolo.judge.probability import Standing
 from piccolo.judge.selection import assess, credit_copies, select
 from piccolo.localization import last_descent
 from piccolo.localization.attempts import end_search
@@ -67,7 +67,7 @@ def test_alternatives_that_come_near_are_refined_and_the_greatest_odds_win(done)
     ]
     found = refine_best(PROBLEM, candidates, ALONE)
     assert done == [*(("climb_to_full", x) for x in (0.0, 3.0, 6.0, 12.0)), ("settle", 6.0)]
-    assert places(found.ranked) == [6.0, 0.0, 3.0, 9.0, 12.0]
+    assert places(found.candidates) == [6.0, 0.0, 3.0, 9.0, 12.0]
     assert found.rival_ratio == pytest.approx(0.5 / 0.6)
 
 
@@ -97,7 +97,7 @@ def test_a_pose_without_rivals_is_refined_by_itself(done, best, num_matches, exp
     candidates = [make_candidate(0.0, best, num_matches), make_candidate(9.0, 0.1 * best)]
     found = refine_best(PROBLEM, candidates, ALONE)
     assert done == [(name, 0.0) for name in expected]
-    assert places(found.ranked) == [0.0, 9.0]
+    assert places(found.candidates) == [0.0, 9.0]
 
 
 @pytest.mark.parametrize(
@@ -143,7 +143,7 @@ def test_of_poses_that_beat_each_other_in_turn_the_one_beaten_least_is_best():
     for order in ((0.0, 3.0, 6.0), (6.0, 0.0, 3.0), (3.0, 6.0, 0.0)):
         given = make_selection(*(replace(make_candidate(x, 0.5, 20), seen=Seen(x)) for x in order))
         selected = select(WHOLE, given)
-        assert places(selected.ranked) == [6.0, 0.0, 3.0]
+        assert places(selected.candidates) == [6.0, 0.0, 3.0]
         assert selected.rival_ratio == pytest.approx(1.0 / 0.9)
 
 
@@ -160,7 +160,7 @@ def test_the_best_pose_has_come_to_rest_and_is_still_the_best(monkeypatch):
     given = make_selection(make_candidate(0.0, 0.5, 20), make_candidate(3.0, 0.5, 20, 0.45))
     found = last_descent.settle_best(PROBLEM, given, ALONE)
     assert rested == [0.0, 3.0]
-    assert places(found.ranked) == [3.01, 0.01]
+    assert places(found.candidates) == [3.01, 0.01]
     rested.clear()
     ends[0.0] = make_candidate(0.01, 0.5, 20, 0.49)
     found = last_descent.settle_best(PROBLEM, given, ALONE)
@@ -203,7 +203,7 @@ def test_copies_by_shape_are_as_likely_as_the_best_unless_a_prior_excludes_them(
     """The pose that was found at the same place as a copy is not reported beside it."""
     found = make_selection(make_candidate(0.0, 0.3), make_candidate(3.1, 0.2), make_candidate(6.0, 0.1))
     reported, is_copy = put_first(found, [make_candidate(3.0, 0.1)])
-    assert (places(reported.ranked), is_copy) == ([0.0, 3.0, 6.0], [True, True, False])
+    assert (places(reported.candidates), is_copy) == ([0.0, 3.0, 6.0], [True, True, False])
     standings = [Standing(r, s, None, "shape", p, s) for r, s, p in ((1.0, 0.3, 0.0), (0.4, 0.1, -4.0))]
     best, copy, other = credit_copies([*standings, standings[1]], is_copy)
     assert (best, copy, other) == (standings[0], standings[0]._replace(log_prior=-4.0), standings[1])

@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 from piccolo.camera import Camera, Mount
 from piccolo.camera.corrections import Corrections
 from piccolo.camera.model import pinhole, whole_sphere
-from piccolo.confidence.claim import Claim, marginal
 from piccolo.evidence.self_calibration import Estimate
 from piccolo.evidence.sphere import CLAIM, SphereFit, count_deviations
 from piccolo.geometry.pose import exp_so3
 from piccolo.geometry.pose_gaussian import probability_of_ball
 from piccolo.geometry.sphere import compute_pixels
+from piccolo.judge.claim import Claim, marginal
 from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.optimize.self_calibration import sum_free_equations
 from piccolo.panorama.texels import pack_texels

@@ -23,12 +23,12 @@ from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_COLORS, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.stream import open_cloud, stream_of_arrays
 from piccolo.cloud.surfaces import paint_shape
-from piccolo.confidence.confidence import log_odds
 from piccolo.errors import InputError
 from piccolo.evidence.examine import complete, examine
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.jobs.threads import Workers
+from piccolo.judge.probability import log_odds
 from piccolo.judge.selection import assess_alone
 from piccolo.localization import localize as method
 from piccolo.localization.shape import align_lines
@@ -279,7 +279,7 @@ def test_edges_drawn_at_the_true_pose_agree_better_than_elsewhere():
     beside = replace(true_pose, center_world=true_pose.center_world + np.array([0.3, 0.0, 0.0]))
     problem = rooms.ask(rooms.as_panorama(taken.rgb), _shape_map())
     found = make_selection(*(replace(examine(problem, pose), score=0.2) for pose in (true_pose, beside)))
-    standings = assess_alone(problem.profile, complete(problem, found, rooms.WORKERS).ranked)
+    standings = assess_alone(problem.profile, complete(problem, found, rooms.WORKERS).candidates)
     assert standings[0].drawn_score > 1.5 * standings[1].drawn_score
     assert log_odds(standings[0]) > log_odds(standings[1])
 

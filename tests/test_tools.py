@@ -17,8 +17,8 @@ import pytest
 from batches import ROOT, command_of, run
 from rooms import write_room
 
-from piccolo.confidence.covariance import PoseCovariance
 from piccolo.geometry.pose import Pose
+from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.localization import attempts
 from piccolo.panorama import read_panorama
 from piccolo.paper.localize import PaperSettings

@@ -14,12 +14,12 @@ from batches import untimed
 import piccolo
 from piccolo.cli import localize as localize_command
 from piccolo.cli.together import steps_file
-from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
 from piccolo.export.formats import tum_lines
 from piccolo.geometry.pose import Pose, carry, pose_errors, yaw_rotation
 from piccolo.jobs import memory
 from piccolo.jobs.threads import Workers
+from piccolo.judge.localization import Localization
 from piccolo.panorama import picture
 from piccolo.photo import Photo
 from piccolo.result import read_results

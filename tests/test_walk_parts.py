@@ -15,11 +15,11 @@ from refusals import assert_input_error
 from test_priors import write_photo
 
 from piccolo.batch.inputs import times_of
-from piccolo.confidence.localization import Alternative, Evidence, Localization
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
 from piccolo.geometry.pose_gaussian import PoseGaussian, probability_within
 from piccolo.judge.belief import make_belief
+from piccolo.judge.localization import Alternative, Evidence, Localization
 from piccolo.judge.reasons import Reason
 from piccolo.photo import Photo
 from piccolo.walk.frames import MOST_ODDS, Frame, State, list_states

@@ -8,10 +8,10 @@ import rooms
 from made_up import make_candidate
 from rooms import WORKERS
 
-from piccolo.confidence.confidence import log_odds
 from piccolo.evidence import verification
 from piccolo.evidence.examine import examine
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
+from piccolo.judge.probability import log_odds
 from piccolo.judge.selection import CHANCE_MATCHES
 from piccolo.localization import ladder, near
 from piccolo.localization.beam import score_briefly, score_mirror

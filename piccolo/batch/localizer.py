@@ -17,9 +17,6 @@ from typing import Any, NamedTuple
 from .. import __version__
 from ..camera import Calibration
 from ..cloud.settings import CloudSettings
-from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
-from ..confidence.focal_length import Consensus
-from ..confidence.localization import FocalLength
 from ..errors import InputError, is_passing
 from ..evidence.focal_length import WIDE
 from ..files.atomic import temporary_folder, write_temporary
@@ -29,6 +26,9 @@ from ..jobs.memory import limit_memory
 from ..jobs.processes import WorkerLostError
 from ..jobs.threads import Workers
 from ..judge.conclude import follow_consensus
+from ..judge.consensus import Consensus
+from ..judge.localization import FocalLength
+from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..judge.sure import SURE_CONFIDENCE
 from ..localization.beside import SurePhoto
 from ..localization.means import Step, Trace

@@ -10,11 +10,11 @@ from ..cloud.octree import build_octree
 from ..cloud.settings import CloudSettings, R_z_from_axis
 from ..cloud.stream import CloudStream, open_cloud
 from ..cloud.writers import describe_unit, write_transformed
-from ..confidence.confidence import LOCALIZED
 from ..files.atomic import is_stream, write_atomically
 from ..geometry.pose import orthonormal, rotation_to_z, yaw_rotation
 from ..gravity.alignment import MAX_LEAN, dot, find_up, level, wall_yaw
 from ..jobs.threads import Workers, num_cores
+from ..judge.probability import LOCALIZED
 from ..opened_scan import OpenedScan
 from ..panorama import read_panorama
 from ..photo import Photo

@@ -14,13 +14,13 @@ from typing import Any, TypeVar
 from tqdm import tqdm
 
 from ..batch.localizer import Answer, Localizer, Task
-from ..confidence.confidence import AMBIGUOUS, LOCALIZED
 from ..errors import InputError, printable
 from ..evidence.focal_length import WIDE
 from ..jobs.cluster import Cluster, connect
 from ..jobs.memory import GB, memory_left, memory_taken
 from ..jobs.processes import Here, Processes, WorkerLostError
 from ..jobs.threads import num_cores
+from ..judge.probability import AMBIGUOUS, LOCALIZED
 from ..judge.sure import WORTH_A_LOOK
 from ..opened_scan import OpenedScan
 from ..result import FAILED, UNREADABLE, Result

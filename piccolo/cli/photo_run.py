@@ -17,12 +17,12 @@ import numpy as np
 from ..batch.inputs import describe_left_out, is_from_stdin, list_panoramas, read_priors
 from ..batch.localizer import LISTINGS, Answer, Localizer, Look, list_changed_by_consensus
 from ..batch.results_file import FileOutput, Output, Records, StreamOutput
-from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..errors import InputError
 from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, temporary_folder, write_atomically
 from ..files.line_file import open_locked, write_line
 from ..jobs.memory import limit_memory
 from ..jobs.threads import Stopwatch, num_cores
+from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..opened_scan import OpenedScan
 from ..panorama import read_panorama
 from ..panorama.cube import is_cube

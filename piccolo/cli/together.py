@@ -19,13 +19,13 @@ from ..batch.localizer import Localizer
 from ..batch.relative_poses import find_scale, read_odometry, read_relative_poses
 from ..batch.results_file import WAYS, Records
 from ..coloring import color_scan
-from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
 from ..files.atomic import STDOUT, is_stream, temporary_folder, write_lines
 from ..files.line_file import Journal, keeping_steps
 from ..geometry.pose import Pose
 from ..jobs.processes import InFlight
 from ..jobs.threads import Stopwatch
+from ..judge.probability import LOCALIZED
 from ..opened_scan import OpenedScan
 from ..panorama.photo import sha256_of
 from ..panorama.video import frames_of_chapters

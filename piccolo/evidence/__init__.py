@@ -1,1 +1,1 @@
-"""What speaks for and against a pose: made here, complete, for those who decide."""
+"""The evidence for and against a pose: made here, complete, for those who decide."""

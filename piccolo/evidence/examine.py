@@ -66,7 +66,7 @@ def complete(problem: Problem, found: Selection, workers: Workers) -> Selection:
         return replace(candidate, edge_score=drawn.score_beyond(DRAWN_CHANCE))
 
     if problem.profile.has_shape:
-        return found.take([fill_edges(candidate) for candidate in found.ranked])
+        return found.take([fill_edges(candidate) for candidate in found.candidates])
     if not problem.profile.uses_matches:
         return found
     ranked = [fill(found.best), *found.alternatives]

@@ -18,14 +18,14 @@ from ..arrays import Array, Mask
 from ..camera import Camera
 from ..camera.corrections import FOCAL, LENS, Corrections
 from ..camera.model import MODELS, RADIAL
-from ..confidence.claim import Claim, marginal
-from ..confidence.focal_length import WRONG_DEVIATION, WRONG_SHARE, Opinion
-from ..confidence.localization import FocalLength
 from ..geometry.pose import Pose, rotate_points
 from ..geometry.pose_gaussian import PoseGaussian, add, probability_within
 from ..geometry.sphere import compute_indices
 from ..jobs.threads import Workers
 from ..judge.candidate import Candidate
+from ..judge.claim import Claim, marginal
+from ..judge.consensus import WRONG_DEVIATION, WRONG_SHARE, Opinion
+from ..judge.localization import FocalLength
 from ..local_features.matching import NO_MATCHES, Matches
 from ..panorama import Panorama
 from ..panorama.model import FocalPrior

@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from ..confidence.localization import Evidence
-from ..confidence.occlusion import compare_occlusion, measure_agreement
 from ..evidence.contradictions import contradictions
 from ..jobs.threads import Workers
 from ..judge.candidate import Selection
 from ..judge.case import Geometry, Measured
+from ..judge.localization import Evidence
 from ..judge.selection import count_matches
 from ..optimize.sampling_loss import sampling_loss
 from ..problem.problem import Problem
 from ..views.zbuffer import visible_points
 from .covariance import estimate_errors
 from .focal_length import FocalFit
+from .occlusion import compare_occlusion, measure_agreement
 from .sphere import SphereFit
 
 Fit = FocalFit | SphereFit
@@ -46,7 +46,7 @@ def measure(problem: Problem, found: Selection, fit: Fit | None, workers: Worker
     loss = sampling_loss(visible_points(points, end.center_world), problem.colors(), end)
     if not math.isfinite(loss):
         return None
-    num_matches = count_matches(problem.profile, found.ranked)
+    num_matches = count_matches(problem.profile, found.candidates)
     uses_matches = problem.profile.uses_matches
     evidence = Evidence(
         score=found.best.score,

@@ -15,10 +15,10 @@ import numpy as np
 from ..arrays import Array
 from ..camera import Camera, Mount
 from ..camera.corrections import Corrections
-from ..confidence.claim import Claim
-from ..confidence.localization import SphereGeometry
 from ..geometry.pose import Pose
 from ..jobs.threads import Workers
+from ..judge.claim import Claim
+from ..judge.localization import SphereGeometry
 from ..problem.problem import Problem
 from ..problem.stages import Limits
 from .self_calibration import Estimate, Freedom, FreeEnd, descend_freely, invert
@@ -110,8 +110,8 @@ def search_geometry(problem: Problem, pose: Pose, claimed: Camera, workers: Work
         middle = problem.view_at(end.pose, "middle")
         image = problem.photo.image("middle")
         end = descend_freely(middle, image, freedom, end.pose, end.values, MIDDLE)
-        fine = problem.view_at(end.pose, "fine"), problem.photo.image("fine")
-        return descend_freely(*fine, freedom, end.pose, end.values, FINE)
+        fine = problem.view_at(end.pose, "fine")
+        return descend_freely(fine, problem.photo.image("fine"), freedom, end.pose, end.values, FINE)
 
     starts = list(itertools.product(HEIGHTS, HORIZONS))
     ends = sorted(workers.map(begin, starts, "fit the panorama"), key=lambda end: end.loss)

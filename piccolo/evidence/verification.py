@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Array32, Bytes
-from ..confidence.occlusion import EXPLAINED, occlusion_mask
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
 from ..geometry.pose_gaussian import LOOSE, differentiate_rays
@@ -30,6 +29,7 @@ from ..local_features.matching import NO_MATCHES, Matches, merge_matches
 from ..local_features.perspective_view import PerspectiveView, add_margin
 from ..local_features.view_image import ViewImage, render_gray
 from ..problem.problem import Problem
+from .occlusion import EXPLAINED, occlusion_mask
 
 PLACE = 0.1  # [m] the scan is drawn at positions on a grid of this spacing
 TURN = 0.05  # [rad] and at rotation vectors on one of this

@@ -13,10 +13,10 @@ import numpy as np
 
 from ..camera import Calibration, Camera, Mount
 from ..cloud.soa import LocalCloud
-from ..confidence.confidence import LOCALIZED
 from ..errors import InputError, unreadable
 from ..files.atomic import is_stream, replacing, write_lines
 from ..geometry.pose import Pose
+from ..judge.probability import LOCALIZED
 from ..panorama import panorama_size
 from ..panorama.gpano import check_size
 from ..result import Result

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array
-from ..confidence.confidence import NOT_LOCALIZED, classify
+from .probability import NOT_LOCALIZED, classify
 from .reasons import Reason
 
 

@@ -101,7 +101,7 @@ class Selection:
     rival_ratio: float = 0.0  # largest ratio of an alternative to the best, over what both views show
 
     @property
-    def ranked(self) -> list[Candidate]:
+    def candidates(self) -> list[Candidate]:
         """The best candidate, then the others."""
         return [self.best, *self.alternatives]
 
@@ -117,7 +117,7 @@ class Selection:
 
     def forget(self) -> "Selection":
         """Return the selection without what takes memory."""
-        return self.take([candidate.forget() for candidate in self.ranked])
+        return self.take([candidate.forget() for candidate in self.candidates])
 
 
 NOTHING = Selection(NO_CANDIDATE, ())

@@ -4,11 +4,11 @@ from typing import NamedTuple
 
 from ..arrays import Array
 from ..camera import Mount
-from ..confidence.confidence import Standing
-from ..confidence.localization import Evidence, FocalLength, SphereGeometry
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
 from .candidate import Selection
+from .localization import Evidence, FocalLength, SphereGeometry
+from .probability import Standing
 from .reasons import Contradiction
 
 
@@ -37,7 +37,7 @@ class Measured(NamedTuple):
 
 
 class Geometry(NamedTuple):
-    """What was found out about the geometry of a photo by comparing it with the scan."""
+    """The geometry of a photo, as found by comparing it with the scan."""
 
     cameras: tuple[Mount, ...]  # as found
     doubt: float  # probability that what was given is wrong and has pulled the pose along
@@ -49,7 +49,7 @@ class Geometry(NamedTuple):
 
 
 class Case(NamedTuple):
-    """What the judge reads of a photo."""
+    """All that the judge reads of a photo."""
 
     found: Selection  # with the alternatives that are reported
     standings: tuple[Standing, ...]  # evidence for the best pose and each alternative

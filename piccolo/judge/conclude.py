@@ -3,14 +3,14 @@
 import math
 from dataclasses import replace
 
-from ..confidence.confidence import LOCALIZED
-from ..confidence.covariance import describe_errors
-from ..confidence.focal_length import MOST_CONFLICT, Opinion
-from ..confidence.localization import Alternative, FocalLength, Localization
 from ..geometry.pose_gaussian import PoseGaussian
 from ..scan_map.scan_map import ScanMap
 from .belief import Belief
 from .case import Case, Geometry
+from .consensus import MOST_CONFLICT, Opinion
+from .localization import Alternative, FocalLength, Localization
+from .pose_covariance import describe_errors
+from .probability import LOCALIZED
 from .reasons import Reason, explain
 
 MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"

@@ -6,10 +6,10 @@ from itertools import compress
 
 import numpy as np
 
-from ..confidence.alternatives import alternative_poses, sort_by_score
-from ..confidence.confidence import CONTRADICTED, Standing, log_odds
 from ..problem.profile import Profile
+from .alternatives import alternative_poses, sort_by_score
 from .candidate import MAX_COMPARED, NOTHING, Candidate, Selection
+from .probability import CONTRADICTED, Standing, log_odds
 from .sure import SURE_ODDS
 
 FAINT_SCORE = 0.1  # a pose with less ends no search: the scan is not drawn to see whether it is sure
@@ -71,7 +71,7 @@ def assess_alone(profile: Profile, ranked: Sequence[Candidate]) -> list[Standing
 def assess(profile: Profile, found: Selection) -> list[Standing]:
     """Return the evidence for the best candidate and for others, compared over what both views show."""
     ratios = [1.0, *(h.seen.compute_ratio(found.best.seen) for h in found.alternatives)]
-    alone = assess_alone(profile, found.ranked)
+    alone = assess_alone(profile, found.candidates)
     return [standing._replace(ratio=ratio) for standing, ratio in zip(alone, ratios, strict=True)]
 
 
@@ -83,7 +83,7 @@ def select(profile: Profile, found: Selection) -> Selection:
     """
     if not found.alternatives:
         return found
-    ranked = found.ranked
+    ranked = found.candidates
     alone = assess_alone(profile, ranked)
     ratios = [[other.seen.compute_ratio(one.seen) for other in ranked] for one in ranked]
     odds = np.array(
@@ -112,9 +112,9 @@ def is_clear(profile: Profile, found: Selection) -> bool:
 
 def is_faint(profile: Profile, found: Selection) -> bool:
     """Return True if all are faint and no more features agree than by chance: refinement soon ends."""
-    if max(h.score for h in found.ranked) >= FAINT_SCORE:
+    if max(h.score for h in found.candidates) >= FAINT_SCORE:
         return False
-    return max(count_matches(profile, found.ranked)) <= CHANCE_MATCHES
+    return max(count_matches(profile, found.candidates)) <= CHANCE_MATCHES
 
 
 def explains_more(mirrored: Candidate, own: Candidate) -> bool:

@@ -1,4 +1,4 @@
-"""How sure is sure enough for what: thresholds of the odds that a pose is right.
+"""Thresholds of the odds that a pose is right: from which it is sure enough for what.
 
 What counts as localized is the user's `min_confidence`. Scores have thresholds of their own in `selection`.
 """

@@ -159,7 +159,7 @@ def end_search(problem: Problem, found: list[Candidate], workers: Workers) -> tu
     if ranked.best.score < FAINT_SCORE:
         return found, False
     chosen = choose(problem, ranked, workers)
-    drawn = {id(candidate.pose): candidate for candidate in chosen.ranked}
+    drawn = {id(candidate.pose): candidate for candidate in chosen.candidates}
     return [drawn.get(id(one.pose), one) for one in found], is_sure(problem.profile, chosen)
 
 
@@ -180,7 +180,7 @@ def add_verified(problem: Problem, candidates: list[Candidate], workers: Workers
         drawn = draw_near(problem, candidate.pose, candidate.drawn, workers)
         return replace(candidate, drawn=drawn), verify(problem, candidate.pose, drawn.matches)
 
-    verified = workers.map(verify_one, rank(candidates).ranked, "verify")
+    verified = workers.map(verify_one, rank(candidates).candidates, "verify")
     drawn = {id(candidate.pose): candidate for candidate, _ in verified}
     matched = [(near, found.pose) for near, found in verified if found.num_matches > CHANCE_MATCHES]
     refined = workers.map(lambda pair: examine(problem, pair[1], pair[0]), matched, "compare")

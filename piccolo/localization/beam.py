@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array, Int64s
-from ..confidence.alternatives import Hypothesis, best_distinct, sort_by_score, suppress_near
 from ..evidence.examine import examine
 from ..geometry.cone import Cone
 from ..geometry.nearness import DESCENDED, DESCENDING, ONE_ANSWER, Nearness, non_maximum_suppression
 from ..geometry.pose import Pose
 from ..jobs.threads import Workers
+from ..judge.alternatives import Hypothesis, best_distinct, sort_by_score, suppress_near
 from ..judge.candidate import Candidate
 from ..kernels.jit import F0, kernel
 from ..optimize.channel_loss import ChannelProblem, descend_channels, score

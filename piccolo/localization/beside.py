@@ -9,8 +9,6 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
-from ..confidence.covariance import PoseCovariance
-from ..confidence.localization import Localization
 from ..evidence.contradictions import contradictions
 from ..evidence.covariance import split_errors
 from ..evidence.examine import examine
@@ -21,6 +19,8 @@ from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_within, turn_positions
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.conclude import take_pose
+from ..judge.localization import Localization
+from ..judge.pose_covariance import PoseCovariance
 from ..judge.selection import SURE_MATCHES
 from ..judge.together import believe_beside
 from ..local_features.hypotheses import exact_pose, propose_poses

@@ -15,15 +15,15 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array
-from ..confidence.confidence import LOCALIZED
-from ..confidence.focal_length import MOST_CONFLICT, Consensus
-from ..confidence.localization import Localization
 from ..evidence.examine import complete, examine
 from ..evidence.focal_length import FocalFit
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_within, subtract
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.candidate import Selection
+from ..judge.consensus import MOST_CONFLICT, Consensus
+from ..judge.localization import Localization
+from ..judge.probability import LOCALIZED
 from ..judge.together import Shares, believe_together
 from ..panorama import Panorama
 from ..problem.settings import CoarseToFineSettings

@@ -9,9 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array
-from ..confidence.confidence import CONTRADICTED, posterior
-from ..confidence.focal_length import MOST_CONFLICT
-from ..confidence.localization import Localization
 from ..evidence.covariance import estimate_errors
 from ..evidence.examine import complete, count_agreeing, examine
 from ..evidence.verification import draw_near, verify
@@ -21,6 +18,9 @@ from ..geometry.pose_gaussian import PoseGaussian
 from ..jobs.threads import Workers
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Errors
+from ..judge.consensus import MOST_CONFLICT
+from ..judge.localization import Localization
+from ..judge.probability import CONTRADICTED, posterior
 from ..judge.selection import assess
 from ..judge.together import LEAST_NONE
 from ..problem.problem import Problem
@@ -61,7 +61,7 @@ class Member:
         """Poses in the map with the probabilities of their places, best first; none of what is ruled out."""
         if self.alone.pose is None or self.alone.belief.ruled_out:
             return []
-        return list(zip(self.found.selection.ranked, self.alone.belief.place[:-1], strict=False))
+        return list(zip(self.found.selection.candidates, self.alone.belief.place[:-1], strict=False))
 
 
 class Support(NamedTuple):
@@ -187,7 +187,7 @@ def find_support(
     ranked += [examine(problem, p) for p in places if not any(ONE_IN_BUNDLE.holds(h.pose, p) for h in ranked)]
     k = next(k for k, h in enumerate(ranked) if h is found)
     selection = complete(problem, Selection(ranked[0], tuple(ranked[1:])), workers)
-    ranked = selection.ranked
+    ranked = selection.candidates
     errors = Errors(member.alone.gaussian, member.alone.std_of_fit)
     fit = member.found.fit
     if found.pose is not member.found.selection.best.pose and found.score > HOPELESS_SCORE:

@@ -1,4 +1,4 @@
-"""What a photo says of its geometry compared with the scan, and its poses refined with what was found."""
+"""The geometry that a photo claims, compared with the scan, and its poses refined with what was found."""
 
 import math
 import operator
@@ -128,11 +128,13 @@ def calibrate_sphere(
     camera = whole_sphere(*problem.given.rgb.shape[1::-1])
     freedom = make_freedom(camera)
     pose = found.best.pose
-    cells = problem.view_at(pose, "fine"), problem.photo.image("fine")
-    points = problem.view_at(pose, "points"), problem.photo.image("full")
+    cells = problem.view_at(pose, "fine")
+    points = problem.view_at(pose, "points")
+    fine = problem.photo.image("fine")
+    full = problem.photo.image("full")
     descents = [
-        partial(descend_freely, *on, freedom, pose, NO_CORRECTION, limits)
-        for on, limits in ((cells, CHECK), (points, HERE))
+        partial(descend_freely, cells, fine, freedom, pose, NO_CORRECTION, CHECK),
+        partial(descend_freely, points, full, freedom, pose, NO_CORRECTION, HERE),
     ]
     ends = workers.map(operator.call, descents, "fit the panorama")
     estimate, here = (estimate_corrections(end, CURVATURE) for end in ends)
@@ -162,8 +164,9 @@ def retake_as_found(
         scored = examine_each(problem, [end.pose, *others], workers)
         best = refine_best(problem, scored, workers)
         pose = best.best.pose
-        points = problem.view_at(pose, "points"), problem.photo.image("full")
-        end = descend_freely(*points, make_freedom(camera), pose, NO_CORRECTION, FULL)
+        points = problem.view_at(pose, "points")
+        full = problem.photo.image("full")
+        end = descend_freely(points, full, make_freedom(camera), pose, NO_CORRECTION, FULL)
         if np.all(np.abs(end.values) < CLAIM.deviations):
             break
     if best.best.score < MIN_GAIN * found.best.score:

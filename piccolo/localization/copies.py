@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from itertools import compress
 
-from ..confidence.alternatives import MAX_ALTERNATIVES, suppress_near
 from ..evidence.examine import complete, examine_each
 from ..evidence.verification import find_copies
 from ..geometry.nearness import ONE_ANSWER
 from ..jobs.threads import Workers
+from ..judge.alternatives import MAX_ALTERNATIVES, suppress_near
 from ..judge.candidate import Candidate, Selection
 from ..judge.selection import find_rivals
 from ..problem.problem import Problem
@@ -23,7 +23,7 @@ def list_reported(
     In a scan without colours copies are searched.
     """
     if not problem.profile.has_shape:
-        reported = found.take(found.ranked[: 1 + MAX_ALTERNATIVES])
+        reported = found.take(found.candidates[: 1 + MAX_ALTERNATIVES])
         return reported, list_copies(problem, reported, workers)
     alike = find_alike(problem, found.best.pose, effort, workers)
     reported, is_copy = put_first(found, examine_each(problem, alike, workers))
@@ -39,7 +39,7 @@ def put_first(found: Selection, copies: Sequence[Candidate]) -> tuple[Selection,
 
 def list_copies(problem: Problem, found: Selection, workers: Workers) -> list[bool]:
     """Return True for the best pose and for copies of its place; of a photo without matches there False."""
-    ranked = found.ranked
+    ranked = found.candidates
     if not problem.profile.uses_matches:
         return [False] * len(ranked)
     is_rival = find_rivals(problem.profile, ranked)[1:]

@@ -7,8 +7,6 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
-from ..confidence.confidence import posterior
-from ..confidence.localization import Localization
 from ..evidence.contradictions import contradictions
 from ..evidence.examine import complete
 from ..evidence.focal_length import FocalFit, doubt_unconfirmed, fit_focal
@@ -19,6 +17,8 @@ from ..judge.belief import Belief, make_belief
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Case
 from ..judge.conclude import conclude
+from ..judge.localization import Localization
+from ..judge.probability import posterior
 from ..judge.selection import assess, credit_copies, is_mirrored
 from ..problem.problem import Problem
 from .copies import list_reported
@@ -57,7 +57,7 @@ def judge(found: Found, means: Means, min_confidence: float, may_promote: bool =
     places = posterior(standings, measured.errors.std_of_fit)[:-1]
     likeliest = int(places.argmax())
     if likeliest and is_copy[likeliest] and may_promote:
-        other = promote(problem, selection, reported.ranked[likeliest], fit, workers)
+        other = promote(problem, selection, reported.candidates[likeliest], fit, workers)
         return judge(other, means, min_confidence, may_promote=False)
     if isinstance(fit, FocalFit):
         fit = doubt_unconfirmed(fit, measured.errors.gaussian)
@@ -71,7 +71,7 @@ def promote(
 ) -> Found:
     """Make a copy of the best pose's place the best."""
     best = settle(problem, copy, workers)
-    others = [h for h in selection.ranked if h.pose is not copy.pose]
+    others = [h for h in selection.candidates if h.pose is not copy.pose]
     ratios = [h.seen.compute_ratio(best.seen) for h in others]
     promoted = complete(problem, Selection(best, tuple(others), max(ratios)), workers)
     if isinstance(fit, FocalFit):

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Array, Array32, Int32s
-from ..confidence.alternatives import Hypothesis
 from ..evidence.comparison import mask_occluders
 from ..evidence.examine import examine
 from ..geometry.pose import Pose, orthonormal
 from ..jobs.threads import Workers
+from ..judge.alternatives import Hypothesis
 from ..judge.candidate import Candidate
 from ..kernels.jit import kernel
 from ..optimize.channel_loss import ChannelProblem, descend_channels, score

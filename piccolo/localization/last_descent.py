@@ -30,7 +30,7 @@ def refine_best(problem: Problem, candidates: Sequence[Candidate], workers: Work
         found = choose_among(problem, [best, *found.alternatives], workers)
         if is_faint(problem.profile, found):
             return found
-    near, far = part_near(found, count_matches(problem.profile, found.ranked)[1:])
+    near, far = part_near(found, count_matches(problem.profile, found.candidates)[1:])
     if not near:
         best = climb_unoccluded(problem, found.best, workers)
         return settle_best(problem, rank([best, *found.alternatives]), workers)

@@ -5,15 +5,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
-from ..confidence.alternatives import MAX_ALTERNATIVES
-from ..confidence.confidence import LOCALIZED
-from ..confidence.localization import Alternative, FocalLength, Localization
 from ..evidence.focal_length import WIDE
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
+from ..judge.alternatives import MAX_ALTERNATIVES
 from ..judge.belief import NOTHING, make_belief
 from ..judge.candidate import Candidate, Selection
+from ..judge.localization import Alternative, FocalLength, Localization
+from ..judge.probability import LOCALIZED
 from ..judge.reasons import Reason
 from ..judge.selection import is_faint, rank
 from ..judge.together import share_place
@@ -124,7 +124,7 @@ def describe_attempt(
         "evidence": problem.profile.evidence,
         "num_positions": len(problem.scan_map.sparse),
         "is_enough": is_enough,
-        "candidates": describe_candidates(problem, rank(candidates).ranked if candidates else []),
+        "candidates": describe_candidates(problem, rank(candidates).candidates if candidates else []),
     }
 
 

@@ -1,4 +1,4 @@
-"""With what a photo is searched: how much, on which threads; and what is noted meanwhile."""
+"""The means of a search: how much is searched, on which threads; and what is noted meanwhile."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ NO_TRACE = Trace()
 
 
 class Means(NamedTuple):
-    """With what a photo is searched."""
+    """The means by which a photo is searched."""
 
     effort: Effort
     workers: Workers
@@ -61,4 +61,4 @@ def describe_candidate(problem: Problem, candidate: Candidate) -> Step:
 
 def describe_selection(problem: Problem, found: Selection) -> Step:
     """Describe ranked candidates, and how far the best leads."""
-    return {"margin": found.margin, "candidates": describe_candidates(problem, found.ranked)}
+    return {"margin": found.margin, "candidates": describe_candidates(problem, found.candidates)}

@@ -1,4 +1,4 @@
-"""Does a photo fit the scan better mirrored, left for right? Then it was turned over."""
+"""A mirrored photo, left for right: if it fits the scan better, the photo was turned over."""
 
 from dataclasses import replace
 

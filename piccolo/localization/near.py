@@ -3,7 +3,6 @@
 from dataclasses import replace
 from typing import NamedTuple
 
-from ..confidence.confidence import Standing, posterior
 from ..evidence.comparison import compare
 from ..evidence.contradictions import contradictions
 from ..evidence.covariance import estimate_covariance
@@ -15,6 +14,7 @@ from ..geometry.pose_gaussian import PoseGaussian
 from ..jobs.threads import Workers
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import UNKNOWN_ERRORS
+from ..judge.probability import Standing, posterior
 from ..judge.selection import assess_alone
 from ..problem.problem import Problem
 from ..problem.stages import FULL, NEARLY
@@ -55,7 +55,7 @@ def assess_end(problem: Problem, end: Candidate, workers: Workers) -> Standing:
     Matches do not count if they put the photo elsewhere, with photos beside or without.
     """
     by_views = problem.by_views()
-    (standing,) = assess_alone(by_views.profile, complete(by_views, Selection(end, ()), workers).ranked)
+    (standing,) = assess_alone(by_views.profile, complete(by_views, Selection(end, ()), workers).candidates)
     if not problem.profile.is_narrow:
         return standing
     drawn = draw_near(problem, end.pose, end.drawn, workers).matches

@@ -6,20 +6,20 @@ from typing import Literal
 
 import numpy as np
 
-from ..arguments import MIN_CONFIDENCE, check_fields
+from ..arguments import MIN_CONFIDENCE, check_confidence, check_fields
 from ..arrays import Array, Array32, Mask
 from ..cloud.soa import LocalCloud, PackedPoints, pack_points
 from ..cloud.stream import Cloud
-from ..confidence.alternatives import Hypothesis, alternative_poses, best_distinct
-from ..confidence.confidence import LEAST_SCORE, check_confidence
-from ..confidence.localization import Alternative, Evidence, Localization
-from ..confidence.occlusion import compare_occlusion, measure_agreement
 from ..errors import InputError
+from ..evidence.occlusion import compare_occlusion, measure_agreement
 from ..geometry.nearness import Nearness
 from ..geometry.pose import Gravity, Pose, uniform_rotations, uniform_yaws
 from ..geometry.sphere import solid_angles
 from ..jobs.threads import Stopwatch, Workers
+from ..judge.alternatives import Hypothesis, alternative_poses, best_distinct
 from ..judge.belief import Belief, make_belief
+from ..judge.localization import Alternative, Evidence, Localization
+from ..judge.probability import LEAST_SCORE
 from ..optimize.refine import DescentSettings, Loss, Refined, make_sampling_loss, refine
 from ..panorama import Panorama
 from ..panorama.model import shrink

@@ -1,1 +1,1 @@
-"""What is asked: a photo's images, a map, and what is known beforehand."""
+"""The problem: a photo's images, a map, and what is known beforehand."""

@@ -1,13 +1,15 @@
-"""What differs between photos of the whole sphere and of a part, in scans with colours and by shape alone."""
+"""Kinds of photos: of the whole sphere or of a part, in scans with colours or by shape alone."""
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
-from ..confidence.confidence import EvidenceKind
 from ..views.candidate_views import SEARCH_VIEW
 from ..views.view import ViewConfig
 from .stages import FIRST, SECOND, Stage, ViewName
+
+# the scan's shape; its coloured views; these, and local features of the scan drawn at the pose
+EvidenceKind = Literal["shape", "views", "drawn scan"]
 
 
 class Beam(NamedTuple):
@@ -53,7 +55,7 @@ SHAPE_SCALES = ImageScales(fine=ImageScales().fine._replace(blur_px=1.7))
 
 @dataclass(frozen=True)
 class Profile:
-    """How a kind of photo is searched and judged."""
+    """A kind of photo: the ways in which it is searched and judged."""
 
     evidence: EvidenceKind  # with what poses are compared
     is_partial: bool  # the photo shows a part of the sphere

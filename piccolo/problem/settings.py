@@ -3,8 +3,7 @@
 from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
-from ..arguments import MIN_CONFIDENCE, check_fields
-from ..confidence.confidence import check_confidence
+from ..arguments import MIN_CONFIDENCE, check_confidence, check_fields
 from ..errors import InputError
 from ..geometry.pose import Gravity
 from ..photo import NOTHING_KNOWN, Prior
@@ -15,7 +14,7 @@ FIRST_STARTS = 300  # of a brief search: few are enough for a clear photo
 
 
 class Effort(NamedTuple):
-    """How much is searched."""
+    """The numbers of rotations and starts of a search."""
 
     num_yaws: int  # rotations with gravity known
     num_rotations: int  # of SO(3), with gravity unknown
@@ -47,7 +46,7 @@ class CoarseToFineSettings:
 
     @property
     def effort(self) -> Effort:
-        """How much is searched."""
+        """The numbers of rotations and starts of a search."""
         return Effort(self.num_yaws, self.num_rotations, self.max_starts)
 
     def to_json(self) -> dict[str, object]:

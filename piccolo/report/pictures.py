@@ -24,14 +24,14 @@ import numpy as np
 from ..arrays import Array, Array32, Bytes, Int64s, Mask
 from ..camera.model import pinhole
 from ..cloud.soa import PackedPoints
-from ..confidence.confidence import AMBIGUOUS
-from ..confidence.occlusion import occlusion_mask
 from ..errors import InputError
+from ..evidence.occlusion import occlusion_mask
 from ..files.atomic import temporary_folder
 from ..files.json_file import read_text
 from ..geometry.colors import unpack_rgb
 from ..geometry.pose import Pose, yaw_rotation
 from ..jobs.threads import Workers
+from ..judge.probability import AMBIGUOUS
 from ..opened_scan import labels_of, photo_of
 from ..panorama import Panorama, read_panorama
 from ..panorama.model import shrink

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 
 from ..arrays import Array
-from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..errors import import_optional
 from ..files.atomic import temporary_folder, write_atomically
+from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..panorama.picture import read_picture
 from ..scan_map.scan_map import ScanMap
 from .build import ReportSettings, Task, check_settings, document_of

@@ -19,12 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import Array
-from ..confidence.confidence import NOT_LOCALIZED
-from ..confidence.covariance import PoseCovariance
 from ..errors import printable
 from ..files.atomic import check_output_folder, write_atomically
 from ..geometry.pose import Pose, heading_pitch_roll_deg
 from ..geometry.pose_gaussian import turn_positions
+from ..judge.pose_covariance import PoseCovariance
+from ..judge.probability import NOT_LOCALIZED
 from ..judge.reasons import Reason
 from ..judge.sure import SHOWN
 from ..result import FAILED, UNREADABLE, Result, read_results

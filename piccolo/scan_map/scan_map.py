@@ -14,7 +14,6 @@ from ..cloud.settings import R_z_from_axis, UpAxis
 from ..cloud.soa import MapFrame, PackedPoints, pack_points
 from ..cloud.stream import CloudStream
 from ..cloud.surfaces import paint_shape, surface_variance
-from ..confidence.localization import Localization
 from ..errors import InputError
 from ..geometry.pose import Pose
 from ..gravity.alignment import find_up, find_yaw_of_walls
@@ -320,21 +319,6 @@ def find_scan_at(scan_map: ScanMap, center_map: Array) -> str | None:
     offsets = scan_map.centers - center_map
     nearest = np.einsum("ij,ij->i", offsets, offsets).argmin()
     return scan_map.scan_names[int(scan_map.scan_of_candidate[nearest])]
-
-
-def add_places(scan_map: ScanMap, found: Localization) -> Localization:
-    """Return a result with the scans, the storey (from 1, the lowest) and the height above the floor."""
-    pose = found.pose
-    if pose is None:
-        return found
-    (storey,), (height,) = scan_map.storeys.at(scan_map.from_world(pose).center_world[None])
-    if storey >= 0:
-        found = replace(found, storey=int(storey) + 1, height_above_floor=round(float(height), 4))
-    if not scan_map.scan_names:
-        return found
-
-    alternatives = tuple(replace(a, scan=scan_of(scan_map, a.pose)) for a in found.alternatives)
-    return replace(found, scan=scan_of(scan_map, pose), alternatives=alternatives)
 
 
 def scan_of(scan_map: ScanMap, pose: Pose) -> str | None:

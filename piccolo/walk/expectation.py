@@ -1,4 +1,4 @@
-"""Where a frame is expected, from where it is tracked, and which end counts: decisions on values."""
+"""Decisions on values: the pose that a frame is expected to have, where tracking starts, which end counts."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

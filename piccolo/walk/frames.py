@@ -15,13 +15,13 @@ import numpy as np
 
 from ..arguments import MAX_SPEED, MAX_STEP, check_fields
 from ..arrays import Array
-from ..confidence.confidence import LOCALIZED
-from ..confidence.localization import Localization
 from ..errors import InputError
 from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
 from ..judge.candidate import Candidate
+from ..judge.localization import Localization
+from ..judge.probability import LOCALIZED
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
 

@@ -15,17 +15,17 @@ import numpy as np
 
 from ..arguments import MIN_CONFIDENCE
 from ..arrays import Array
-from ..confidence.alternatives import MAX_ALTERNATIVES
-from ..confidence.confidence import LOCALIZED
-from ..confidence.covariance import describe_errors
-from ..confidence.focal_length import MOST_CONFLICT
-from ..confidence.localization import Alternative, Localization
 from ..evidence.contradictions import contradictions
 from ..geometry.pose import Pose, carry
 from ..geometry.pose_gaussian import PoseGaussian, add, probability_within
 from ..jobs.threads import Progress, no_progress, one_blas_thread
+from ..judge.alternatives import MAX_ALTERNATIVES
 from ..judge.belief import make_belief
 from ..judge.conclude import take_pose
+from ..judge.consensus import MOST_CONFLICT
+from ..judge.localization import Alternative, Localization
+from ..judge.pose_covariance import describe_errors
+from ..judge.probability import LOCALIZED
 from ..judge.reasons import explain
 from ..problem.problem import Problem
 from .expectation import Expected, Followed

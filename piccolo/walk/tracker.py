@@ -7,13 +7,13 @@ from itertools import compress
 
 import numpy as np
 
-from ..confidence.confidence import MODELS, Standing, pose_features, posterior
 from ..evidence.examine import complete, examine
 from ..evidence.verification import draw_near, match_beside, place_keypoints, verify
 from ..geometry.nearness import ONE_ANSWER, ONE_PLACE, non_maximum_suppression
 from ..geometry.pose import Pose, uniform_yaws
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.candidate import Selection
+from ..judge.probability import MODELS, Standing, pose_features, posterior
 from ..judge.selection import assess
 from ..judge.sure import SURE_ODDS
 from ..localization.attempts import is_whole

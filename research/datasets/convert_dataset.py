@@ -23,8 +23,8 @@ from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.soa import pack_points
 from piccolo.cloud.stream import open_cloud, open_source
 from piccolo.cloud.writers import vertex_rows, writing_ply
-from piccolo.confidence.occlusion import VIEW_WIDTH, measure_agreement
 from piccolo.errors import InputError, unreadable
+from piccolo.evidence.occlusion import VIEW_WIDTH, measure_agreement
 from piccolo.files.atomic import check_output_folder, replacing_folder, write_atomically
 from piccolo.geometry.pose import Pose, move, transform_points
 from piccolo.jobs.threads import Progress, Workers
@@ -66,7 +66,7 @@ class ConventionCheck(NamedTuple):
     """The fit of a panorama to the cloud at its pose, by this convention and by others."""
 
     image: str  # as queries.json has it
-    score: float  # of the pose as given, [-1, 1], by confidence/occlusion.py
+    score: float  # of the pose as given, [-1, 1], by evidence/occlusion.py
     best_score: float  # the highest score by any convention
     best: str  # that convention in words
 

@@ -12,11 +12,11 @@ import numpy as np
 
 from piccolo.arrays import Array
 from piccolo.batch.results_file import check_as_expected
-from piccolo.confidence.confidence import LOCALIZED
 from piccolo.errors import InputError, printable
 from piccolo.files.json_file import document_of, parse_lines, read_bytes
 from piccolo.files.line_file import whole_size
 from piccolo.geometry.pose import MAX_ANGLE, MAX_DISTANCE, Pose, pose_errors
+from piccolo.judge.probability import LOCALIZED
 from piccolo.opened_scan import OpenedScan
 from piccolo.result import Result
 

@@ -13,14 +13,15 @@ from scipy.special import chdtri
 from piccolo.arguments import MIN_CONFIDENCE
 from piccolo.arrays import Array
 from piccolo.cli.command import Arguments, option
-from piccolo.confidence import confidence
-from piccolo.confidence.confidence import AMBIGUOUS, LOCALIZED, ChoiceModel, EvidenceKind, Standing
-from piccolo.confidence.covariance import PoseCovariance
 from piccolo.files.json_file import parse_lines, read_bytes
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import MAX_DISTANCE
 from piccolo.geometry.pose_gaussian import probability_of_ball, subtract
+from piccolo.judge import probability as confidence
 from piccolo.judge.belief import make_belief
+from piccolo.judge.pose_covariance import PoseCovariance
+from piccolo.judge.probability import AMBIGUOUS, LOCALIZED, ChoiceModel, Standing
+from piccolo.problem.profile import EvidenceKind
 
 from ..evaluation.tables import Table, reliability_table
 from ..scene import pose_of
@@ -30,7 +31,7 @@ example:
   python tools/benchmark.py calibration --fit trials.jsonl --check others.jsonl bench.jsonl
 
 The files are those of tools/benchmark.py confidence. Prints the fitted weights, to be copied to
-piccolo/confidence/confidence.py, and tables for each set of trials: how reliable the probabilities of the
+piccolo/judge/probability.py, and tables for each set of trials: how reliable the probabilities of the
 fitted model are (without --fit, of the model in use), and the fraction of true poses inside the confidence
 regions of the covariance.
 """

@@ -12,10 +12,10 @@ from piccolo import CoarseToFineSettings, Photo
 from piccolo.arrays import Bytes, Values
 from piccolo.cli.command import Arguments, option
 from piccolo.cloud.stream import open_cloud, stream_of_arrays
-from piccolo.confidence.localization import Localization
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Stopwatch, Workers, num_cores
+from piccolo.judge.localization import Localization
 from piccolo.localization.localize import localize
 from piccolo.panorama import read_panorama
 from piccolo.scan_map.scan_map import ScanMap, prepare_map

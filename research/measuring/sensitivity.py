@@ -14,10 +14,10 @@ import numpy as np
 
 from piccolo.cli.command import Arguments, option
 from piccolo.cloud.stream import stream_of_arrays
-from piccolo.confidence.confidence import LOCALIZED
-from piccolo.confidence.localization import Localization
 from piccolo.geometry.nearness import RIGHT
 from piccolo.jobs.threads import Workers, num_cores
+from piccolo.judge.localization import Localization
+from piccolo.judge.probability import LOCALIZED
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
 
 from ..evaluation.tables import table_of
@@ -37,8 +37,8 @@ results changed at all. A cosine is moved by its angle. docs/METHOD.md has the t
 STEP = 0.2
 # by module of piccolo; those of compiled kernels and of the map can't be moved once that is made
 CONSTANTS: dict[str, tuple[str, ...]] = {
-    "confidence.confidence": ("LEAST_RATIO", "NOISE_MATCHES"),
-    "confidence.occlusion": ("CONTRADICTING", "SIGMA_DEG"),
+    "judge.probability": ("LEAST_RATIO", "NOISE_MATCHES"),
+    "evidence.occlusion": ("CONTRADICTING", "SIGMA_DEG"),
     "evidence.covariance": ("MOST_SCORE", "PIXEL_SHARE", "UNCALIBRATED_SHARE"),
     "evidence.focal_length": ("INFLATION_OF_ALL",),
     "evidence.lens_matches": ("INFLATION", "MATCHED_DEVIATION"),

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array
-from .focal_length import MOST_LOG
+from .consensus import MOST_LOG
 
 
 class Claim(NamedTuple):

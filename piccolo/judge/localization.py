@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from ..camera import Mount
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
-from ..judge.belief import NOTHING, Belief, decide
-from .confidence import NOT_LOCALIZED, Standing
-from .covariance import PoseCovariance
-from .focal_length import Opinion
+from .belief import NOTHING, Belief, decide
+from .consensus import Opinion
+from .pose_covariance import PoseCovariance
+from .probability import NOT_LOCALIZED, Standing
 
 
 @dataclass(frozen=True)

@@ -2,18 +2,16 @@
 
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..arrays import Array
-from ..errors import InputError
+from ..problem.profile import EvidenceKind
 
 LOCALIZED = "localized"
 AMBIGUOUS = "ambiguous"
 NOT_LOCALIZED = "not_localized"
-# the scan's shape; its coloured views; these, and local features of the scan drawn at the pose
-EvidenceKind = Literal["shape", "views", "drawn scan"]
 
 
 class Standing(NamedTuple):
@@ -99,9 +97,3 @@ def classify(probabilities: Array, min_confidence: float) -> str:
     if probabilities[0] >= min_confidence:
         return LOCALIZED
     return AMBIGUOUS if 1.0 - probabilities[-1] >= min_confidence else NOT_LOCALIZED
-
-
-def check_confidence(min_confidence: float) -> None:
-    """Refuse a threshold that no confidence can pass or fail."""
-    if not 0.0 < min_confidence < 1.0:
-        raise InputError(f"`min_confidence`: found {min_confidence}, wanted above 0 and below 1")

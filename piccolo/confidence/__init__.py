@@ -1,1 +1,0 @@
-"""Trust in a pose: score, alternatives, covariance, status."""
