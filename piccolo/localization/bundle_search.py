@@ -56,11 +56,11 @@ class Member:
 
     @property
     def own_poses(self) -> list[tuple[Hypothesis, float]]:
-        """Poses in the map with the probabilities of their places, best first; none of what is ruled out."""
+        """Poses in the map with the probabilities of their places, best first; none if ruled out."""
         if self.alone.pose is None or self.alone.belief.ruled_out:
             return []
         hypotheses = [self.selection.best, *self.selection.alternatives]
-        return list(zip(hypotheses, self.alone.belief.place[:-1], strict=False))
+        return list(zip(hypotheses, self.alone.belief.sound_places[:-1].tolist(), strict=False))
 
 
 class Support(NamedTuple):
