@@ -42,7 +42,9 @@ def check_probabilities(result):
         return
     if abs(sum(known) - 1.0) > ROUNDING:
         yield f"probabilities {known} that add up to {sum(known)}"
-    if result.belief is not None and result.best_pose is not None:
+    if result.belief is None:
+        yield "probabilities without a belief"
+    elif result.best_pose is not None:
         told = [result.confidence, *others, result.probability_none]
         believed = result.belief.probabilities
         if len(believed) != len(told) or np.abs(believed - told).max() > ROUNDING:

@@ -127,7 +127,7 @@ export class Facts {
 
   private alternatives(photo: Photo): HTMLElement {
     const { model } = this;
-    const row = (index: number | null, label: string, probability: number | null, where: string) =>
+    const row = (index: number | null, label: string, probability: number, where: string) =>
       h(
         "button",
         {
@@ -147,12 +147,12 @@ export class Facts {
         },
         h("span", {}, label),
         h("span", { class: "quiet" }, where),
-        h("b", {}, probability === null ? "" : percent(probability)),
+        h("b", {}, percent(probability)),
       );
     const away = (pose: Pose) => length(1000 * Math.hypot(...pose.world.map((value, k) => value - photo.pose!.world[k])));
     const rows = photo.alternatives.map((other, index) => row(index, text.alternative(index + 1), other.probability, away(other.pose)));
-    const isLikely = (index: number) => (photo.alternatives[index].probability ?? 1) >= 0.01;
-    const isBeaten = photo.alternatives.some((other) => (other.probability ?? 0) > photo.confidence);
+    const isLikely = (index: number) => photo.alternatives[index].probability >= 0.01;
+    const isBeaten = photo.alternatives.some((other) => other.probability > photo.confidence);
     const unlikely = rows.filter((_, index) => !isLikely(index));
     return section(
       text.alternatives,

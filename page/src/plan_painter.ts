@@ -290,7 +290,7 @@ export class PlanPainter {
       context.fillStyle = this.color("halo");
       context.fill();
       context.stroke();
-      if (alternative.probability !== null) this.label(`${Math.round(100 * alternative.probability)} %`, at.x, at.y - 12);
+      this.label(`${Math.round(100 * alternative.probability)} %`, at.x, at.y - 12);
     }
   }
 

@@ -19,7 +19,7 @@ export interface Pose {
 export interface Alternative {
   pose: Pose;
   score: number;
-  probability: number | null;
+  probability: number;
   scan: string | null;
   storey: number | null;
 }

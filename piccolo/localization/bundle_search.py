@@ -58,10 +58,11 @@ class Member:
 
     @property
     def own_poses(self) -> list[tuple[Candidate, float]]:
-        """Poses in the map with the probabilities of their places, best first; none of what is ruled out."""
+        """Poses in the map with the probabilities of their places, best first; none if ruled out."""
         if self.alone.pose is None or self.alone.belief.ruled_out:
             return []
-        return list(zip(self.found.selection.candidates, self.alone.belief.place[:-1], strict=False))
+        places = self.alone.belief.sound_places[:-1].tolist()
+        return list(zip(self.found.selection.candidates, places, strict=False))
 
 
 class Support(NamedTuple):

@@ -113,7 +113,7 @@ def make_pictures(
 def _shown(result: Result) -> list[bool]:
     """Which alternatives are worth a picture."""
     most = MAX_ALTERNATIVES if result.status == AMBIGUOUS else 0
-    shares = [other.probability or 0.0 for other in result.alternatives]
+    shares = [other.probability for other in result.alternatives]
     return [share >= LEAST_PROBABILITY and k < most for k, share in enumerate(shares)]
 
 

@@ -134,7 +134,7 @@ def document_of_found(result: Result, best_pose: Pose, scan_map: ScanMap) -> dic
         {
             **pose_document(other.pose, scan_map),
             "score": round(other.score, 3),
-            "probability": _round(other.probability, 5),
+            "probability": round(other.probability, 5),
             "scan": other.scan,
             "storey": storey,
         }
