@@ -42,6 +42,7 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
     "localization.attempts": ("ENOUGH_MATCHES", "MIRROR_RATIO", "NUM_MATCHED"),
     "localization.beam": ("FAINT_PART", "FIRST_STARTS", "NUM_FOUND", "NUM_SCORED"),
     "localization.comparison": ("LEAST_SHARED",),
+    "local_features.matching": ("DISTINCT_RATIO",),
     "localization.covariance": ("MOST_SCORE", "PIXEL_SHARE", "UNCALIBRATED_SHARE"),
     "localization.focal_length": ("CLEARLY", "INFLATION_OF_ALL"),
     "localization.lens_matches": ("INFLATION", "MATCHED_DEVIATION"),
@@ -53,7 +54,6 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
     "localization.verification": (
         "CHANCE_MATCHES",
         "COS_AGREE",
-        "DISTINCT_RATIO",
         "MOST_RIVALS",
         "RIVAL_SCORE",
         "SURE_MATCHES",
