@@ -10,7 +10,7 @@ from test_pose import covariance
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
 from piccolo.geometry.pose_gaussian import add, differentiate_rays, subtract
 from piccolo.geometry.robust import redescend
-from piccolo.optimize.gauss_newton import Equations, descend, sum_observations, whiten
+from piccolo.optimize.gauss_newton import Equations, minimize, sum_observations, whiten
 
 LIMIT = 9.0
 robustly = partial(redescend, limit=LIMIT)
@@ -65,7 +65,7 @@ def test_a_linear_problem_is_solved_by_one_step_without_damping():
 def test_a_camera_is_found_from_afar_whatever_a_third_of_the_rays_says(num_wrong):
     true_pose, equations = _camera(5, num_wrong)
     start = add(true_pose, np.array([0.01, -0.02, 0.01, 0.05, 0.03, -0.04]))
-    pose, found = descend(equations, add, start, 30, 1e-9)
+    pose, found = minimize(equations, add, start, 30, 1e-9)
     errors = subtract(pose, true_pose)
     assert errors @ np.linalg.solve(np.linalg.inv(found.matrix), errors) < 16.8  # chi square of 6 at 99 %
     assert np.abs(found.gradient).max() < 1e-4 * np.abs(equations(start).gradient).max()
@@ -82,7 +82,7 @@ def test_a_step_that_raises_the_loss_is_not_taken():
         return sum_observations(residuals, J, lambda square: (0.5 * square, np.ones_like(square)))
 
     asked = []
-    state, found = descend(equations, np.add, np.array([-1.2, 1.0]), 60, 1e-9)
+    state, found = minimize(equations, np.add, np.array([-1.2, 1.0]), 60, 1e-9)
     np.testing.assert_allclose(state, [1.0, 1.0], atol=1e-6)
     assert max(asked) > asked[0]  # such a step was tried
     assert found.loss == min(asked)
@@ -95,7 +95,7 @@ def test_it_ends_where_no_step_lowers_the_loss():
         asked.append(at)
         return Equations(float(len(asked)), np.ones(1), np.eye(1))
 
-    assert descend(equations, np.add, np.zeros(1), 100, 1e-9)[0] == 0.0
+    assert minimize(equations, np.add, np.zeros(1), 100, 1e-9)[0] == 0.0
     assert len(asked) < 12
 
 
@@ -110,6 +110,6 @@ def test_a_rotation_is_found_by_its_logarithm():
         near = sum_observations(off, J, lambda square: (0.5 * square, np.ones_like(square)))
         return near.add_known(np.zeros(6), 1e-6 * np.eye(6))
 
-    pose, _ = descend(equations, add, Pose(rotations[0], np.zeros(3)), 30, 1e-10)
+    pose, _ = minimize(equations, add, Pose(rotations[0], np.zeros(3)), 30, 1e-10)
     away = sum(log_so3(pose.R_cam_from_world @ R.T) for R in rotations)
     np.testing.assert_allclose(away, 0.0, atol=1e-6)

@@ -11,7 +11,15 @@ from scipy.spatial import cKDTree
 from piccolo.jobs.threads import Workers
 from piccolo.local_features import feature_map
 from piccolo.local_features.keypoints import Keypoints
-from piccolo.local_features.matching import FAR, NUM_NEIGHBORS, match, nearest_lists, search_lists
+from piccolo.local_features.matching import (
+    DISTINCT_IN_MAP,
+    FAR,
+    NUM_NEIGHBORS,
+    is_distinct,
+    match,
+    nearest_lists,
+    search_lists,
+)
 from piccolo.localization.attempts import join_features
 
 
@@ -51,6 +59,15 @@ def test_lists_equal_a_search_of_all_where_all_are_looked_through():
     assert (distances[of_list[:, 0]] == FAR).all()
     lists = np.searchsorted(start, found, side="right") - 1
     assert ((lists == probes[:, :1]) | (found < 0)).all()
+
+
+def test_a_ratio_is_one_of_distances_though_squares_are_given():
+    squares = np.array([63.9, 64.0, 79.9, 80.1, 81.0]) ** 2
+    elsewhere = np.full(5, 100.0**2)
+    assert is_distinct(squares, elsewhere, 0.8).tolist() == [True, True, True, False, False]
+    counts = np.array([3, 4, 39_999, 40_000])  # of whole numbers, a fifth less is not enough
+    others = np.array([5, 5, 50_000, 50_000])
+    assert is_distinct(counts, others, DISTINCT_IN_MAP).tolist() == [True, False, True, False]
 
 
 def test_nearest_lists_and_middles_by_brute_force():

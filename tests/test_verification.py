@@ -23,6 +23,7 @@ from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.judge.candidate import Drawn
 from piccolo.judge.selection import find_rivals
+from piccolo.local_features import matching
 from piccolo.local_features.hypotheses import count_matches
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import NO_MATCHES
@@ -113,7 +114,7 @@ def test_a_mirrored_photo_has_no_matches_beside():
     taken = Panorama(_narrow()[0].rgb[:, ::-1].copy(), _narrow()[0].is_valid[:, ::-1].copy())
     mirrored = rooms.ask(taken, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
     own = mirrored.photo.seen(WORKERS).keypoints
-    assert len(verification.match_pictures(own, _beside().keypoints)[0]) > 0
+    assert len(matching.match_pictures(own, _beside().keypoints)[0]) > 0
     assert verification.match_beside(mirrored, _beside(), WORKERS) is NO_MATCHES
 
 
@@ -365,7 +366,7 @@ def test_the_least_distance_elsewhere_is_that_of_a_plain_search():
     distances = rng.integers(0, 1000, (30, 40)).astype(np.float32)
     nearest = distances.argmin(axis=1)
     found = np.empty(30, np.float32)
-    verification.find_elsewhere(distances, np.ascontiguousarray(rays.T), nearest, found)
+    matching.find_elsewhere(distances, np.ascontiguousarray(rays.T), nearest, found)
     cosines = rays[nearest].astype(np.float64) @ rays.astype(np.float64).T
     expected = np.where(cosines > math.cos(math.radians(2.0)), np.inf, distances).min(axis=1)
     np.testing.assert_array_equal(found, expected)
@@ -404,7 +405,7 @@ def test_pictures_are_matched_as_their_twin(seed):
     unknown = rng.integers(0, 60, (60, 128)).astype(np.uint8)
     own = _keypoints(np.zeros((150, 3)), np.concatenate([descriptors[:90] + noise, unknown]))
     drawn = _keypoints(rays, descriptors)
-    mine, theirs = verification.match_pictures(own, drawn)
+    mine, theirs = matching.match_pictures(own, drawn)
     assert list(zip(mine, theirs, strict=True)) == _match_one_by_one(own, drawn)
     assert set(range(40)) | set(range(80, 90)) <= set(mine)
     assert not set(range(40, 80)) & set(mine)
@@ -416,8 +417,8 @@ def test_without_features_nothing_matches_and_a_lone_one_is_distinct():
     own = _keypoints(np.eye(3), rng.integers(0, 60, (3, 128)).astype(np.uint8))
     nothing = own.take(np.empty(0, np.int64))
     for a, b in ((own, nothing), (nothing, own), (nothing, nothing)):
-        assert [len(found) for found in verification.match_pictures(a, b)] == [0, 0]
-    mine, theirs = verification.match_pictures(own, own.take(np.array([1])))
+        assert [len(found) for found in matching.match_pictures(a, b)] == [0, 0]
+    mine, theirs = matching.match_pictures(own, own.take(np.array([1])))
     assert (mine.tolist(), theirs.tolist()) == ([0, 1, 2], [0, 0, 0])
 
 

@@ -22,7 +22,7 @@ from ..localization.bundle_adjustment import (
     match_median,
     robustly,
 )
-from ..optimize.gauss_newton import Equations, descend, sum_observations, whiten
+from ..optimize.gauss_newton import Equations, minimize, sum_observations, whiten
 
 LEAST_PHOTOS = 4
 NUM_ROUNDS = 5  # in which errors and the mount are estimated in turn
@@ -58,8 +58,8 @@ class Sighting(NamedTuple):
     time: float  # by the photos' clock, or of its given pose
 
 
-class Mount(NamedTuple):
-    """The unknowns: how a camera sits, and its clock."""
+class Unknowns(NamedTuple):
+    """The unknowns of a mount."""
 
     cam_from_body: Pose
     clock: float  # [s] to be added to photos' times
@@ -85,7 +85,7 @@ def fit_mount(sightings: Sequence[Sighting], trajectory: Trajectory) -> MountFit
         _check_times(np.array([sighting.time for sighting in sightings]), trajectory.times)
     own = [sighting.covariance for sighting in sightings]
     errors = RelativeErrors()
-    mount = Mount(_begin(sightings, trajectory, errors), 0.0)
+    mount = Unknowns(_begin(sightings, trajectory, errors), 0.0)
     for _ in range(NUM_ROUNDS):
         mount, covariance = _adjust(mount, sightings, trajectory, errors)
         steps = np.array([-_compare(mount, sighting, trajectory)[0] for sighting in sightings])
@@ -100,20 +100,20 @@ def fit_mount(sightings: Sequence[Sighting], trajectory: Trajectory) -> MountFit
 
 
 def _adjust(
-    begin: Mount, sightings: Sequence[Sighting], trajectory: Trajectory, errors: RelativeErrors
-) -> tuple[Mount, Array]:
+    begin: Unknowns, sightings: Sequence[Sighting], trajectory: Trajectory, errors: RelativeErrors
+) -> tuple[Unknowns, Array]:
     """Adjust a mount to photos; those far off count less. Return also its covariance (7, 7)."""
     spreads = np.array([sighting.covariance + errors.covariance for sighting in sightings])
 
-    def equations(at: Mount) -> Equations:
+    def equations(at: Unknowns) -> Equations:
         compared = [_compare(at, sighting, trajectory) for sighting in sightings]
         off, J = (whiten(spreads, np.array(values)) for values in zip(*compared, strict=True))
         return sum_observations(off, J, robustly).add_known(np.zeros(7), LOOSE * np.eye(7))
 
-    def move(at: Mount, step: Array) -> Mount:
-        return Mount(add(at.cam_from_body, step[:6]), at.clock + float(step[6]))
+    def move(at: Unknowns, step: Array) -> Unknowns:
+        return Unknowns(add(at.cam_from_body, step[:6]), at.clock + float(step[6]))
 
-    mount, found = descend(equations, move, begin, NUM_STEPS, SETTLED)
+    mount, found = minimize(equations, move, begin, NUM_STEPS, SETTLED)
     return mount, np.asarray(np.linalg.inv(found.matrix))
 
 
@@ -146,7 +146,7 @@ def _begin(sightings: Sequence[Sighting], trajectory: Trajectory, errors: Relati
     return choose_agreed(mounts, lambda mount: np.array([subtract(m, mount) for m in mounts]), errors)
 
 
-def _compare(mount: Mount, sighting: Sighting, trajectory: Trajectory) -> tuple[Array, Array]:
+def _compare(mount: Unknowns, sighting: Sighting, trajectory: Trajectory) -> tuple[Array, Array]:
     """Return the step (6,) from a photo's pose to where the mount puts it, and its derivative (6, 7)."""
     cam_from_body, clock = mount
     time = sighting.time + clock

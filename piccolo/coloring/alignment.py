@@ -22,7 +22,7 @@ from ..geometry.sphere import direction_to_pixel, pixel_jacobian, pixel_rays
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, Scalar, kernel, whole
 from ..local_features.view_image import render_gray
-from ..optimize.gauss_newton import Equations, descend
+from ..optimize.gauss_newton import Equations, minimize
 from ..panorama import Panorama, texels
 from ..panorama.model import resize
 
@@ -202,7 +202,7 @@ def agree(
     def move(at: list[Pose], delta: Array) -> list[Pose]:
         return [step(pose, delta[6 * k : 6 * k + 6]) for k, pose in enumerate(at)]
 
-    return descend(equations, move, poses, NUM_STEPS, SETTLED)[0]
+    return minimize(equations, move, poses, NUM_STEPS, SETTLED)[0]
 
 
 @kernel

@@ -52,7 +52,6 @@ def fit_matches(camera: Mount, pose: Pose, matches: Matches, widths: tuple[float
         return MatchFit(np.zeros(len(LENS)), 0.0, pose)
     corrections = Corrections(camera)
     prior = np.diag([0.0] * NUM_OF_POSE + list((LEAST_ERROR / np.array(widths)) ** 2))
-    prior += LOOSE * np.eye(len(prior))
     end = pose
     values = np.zeros(len(LENS))
     for scale in MATCH_SCALES:
@@ -64,6 +63,7 @@ def fit_matches(camera: Mount, pose: Pose, matches: Matches, widths: tuple[float
         robust = partial(geman_mcclure, inverse_scale2=scale**-2)
         found = sum_observations(residuals, J, robust)
         found = found.add_known(np.concatenate([np.zeros(NUM_OF_POSE), values]), prior)
+        found = found.add_known(np.zeros(len(prior)), LOOSE * np.eye(len(prior)))
         step = found.solve()
         end = add(end, step[:NUM_OF_POSE])
         values = np.clip(values + step[NUM_OF_POSE:], -MOST, MOST)

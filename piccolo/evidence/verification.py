@@ -22,10 +22,9 @@ from ..geometry.sphere import compute_indices
 from ..jobs.threads import Workers
 from ..judge.candidate import Drawn
 from ..judge.selection import CHANCE_MATCHES
-from ..kernels.jit import kernel
 from ..local_features.hypotheses import COS_EXACT, LEAST_MATCHES, count_matches, exact_pose, find_inliers
 from ..local_features.keypoints import Keypoints, find_in_view, join_keypoints
-from ..local_features.matching import NO_MATCHES, Matches, merge_matches
+from ..local_features.matching import NO_MATCHES, Matches, match_pictures, merge_matches
 from ..local_features.perspective_view import PerspectiveView, add_margin
 from ..local_features.view_image import ViewImage, render_gray
 from ..problem.problem import Problem
@@ -34,8 +33,6 @@ from .occlusion import EXPLAINED, occlusion_mask
 PLACE = 0.1  # [m] the scan is drawn at positions on a grid of this spacing
 TURN = 0.05  # [rad] and at rotation vectors on one of this
 AROUND = 12  # [px] around the photo that are drawn too: it moves when the pose is refined
-DISTINCT_RATIO = 0.8  # of the best distance to the second best elsewhere, at most (Lowe, 2004)
-COS_ELSEWHERE = np.float32(math.cos(math.radians(2.0)))
 COS_AGREE = math.cos(math.radians(0.5))  # matches with a smaller error agree
 LEAST_ERROR = 2e-3  # [rad] of a keypoint along an axis: a third of a pixel
 # of the covariance by matches with the drawn scan, whose errors are not independent: by 76 crops of three
@@ -211,38 +208,3 @@ def find_drawn(problem: Problem, pose: Pose, view: PerspectiveView) -> tuple[Key
     ranges = image.ranges[view.project(found.rays)]
     is_seen = np.flatnonzero(ranges > 0.0)
     return found.take(is_seen), ranges[is_seen]
-
-
-def match_pictures(own: Keypoints, others: Keypoints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Match each feature with the most similar one, unless another elsewhere is nearly as similar.
-
-    Squared distances of 8-bit descriptors are whole numbers, exact in float32 by any matrix product.
-    """
-    if not len(own.rays) or not len(others.rays):
-        nothing = np.empty(0, np.intp)
-        return nothing, nothing
-    a = own.descriptors.astype(np.float32)
-    b = others.descriptors.astype(np.float32)
-    distances = a @ (np.float32(-2.0) * b).T
-    distances += (b * b).sum(axis=1)
-    nearest = distances.argmin(axis=1)
-    best = distances[np.arange(len(a)), nearest]
-    elsewhere = np.empty(len(a), np.float32)
-    find_elsewhere(distances, np.ascontiguousarray(others.rays.T), nearest, elsewhere)
-    own_squares = (a * a).sum(axis=1)
-    is_distinct = best + own_squares < DISTINCT_RATIO**2 * (elsewhere + own_squares)
-    return np.flatnonzero(is_distinct), nearest[is_distinct]
-
-
-@kernel
-def find_elsewhere(distances: Array32, rays: Array32, nearest: NDArray[np.intp], elsewhere: Array32) -> None:
-    """Write the least distance (N,) of each row (N, M) but to those with rays (3, M) near the nearest's."""
-    x, y, z = rays
-    for i in range(len(nearest)):
-        k = nearest[i]
-        row = distances[i]
-        least = np.float32(np.inf)
-        for j in range(len(row)):
-            is_apart = x[k] * x[j] + y[k] * y[j] + z[k] * z[j] <= COS_ELSEWHERE
-            least = min(least, row[j] if is_apart else np.float32(np.inf))
-        elsewhere[i] = least

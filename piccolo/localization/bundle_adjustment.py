@@ -15,7 +15,7 @@ from ..arrays import Array
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LIKELY, LOOSE, PoseGaussian, add, differentiate, mean_of, subtract
 from ..geometry.robust import redescend
-from ..optimize.gauss_newton import Equations, descend, sum_observations, whiten
+from ..optimize.gauss_newton import Equations, minimize, sum_observations, whiten
 
 RelativeScale = Literal["metres", "unknown"]  # of the positions of relative poses
 UNKNOWN_SCALE = 10.0  # deviation of the logarithm of a scale that is not known
@@ -106,7 +106,7 @@ def adjust(bundle: Bundle, estimates: Sequence[Estimate], errors: RelativeErrors
     def move(at: Bundle, step: Array) -> Bundle:
         return Bundle(add(at.pose, step[:6]), at.log_scale + float(step[6]))
 
-    adjusted, found = descend(equations, move, bundle, NUM_ADJUSTMENTS, SETTLED)
+    adjusted, found = minimize(equations, move, bundle, NUM_ADJUSTMENTS, SETTLED)
     common = mean_of([own.common for own, _ in estimates])
     return Adjusted(adjusted, np.asarray(np.linalg.inv(found.matrix)), common)
 

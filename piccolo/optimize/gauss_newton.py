@@ -18,7 +18,9 @@ import numpy as np
 from ..arrays import Array
 from .levenberg_marquardt import FALL, FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING
 
-RISE = 6.0  # of the damping after a step that is not taken
+# chosen: factor of the damping after a step that is not taken. A lens takes few steps, and with 8, as kernels
+# have, it ends elsewhere.
+REFUSED = 6.0
 Robust = Callable[[Array], tuple[Array, Array]]  # losses and weights (N,) of squares (N,)
 State = TypeVar("State")
 
@@ -56,7 +58,7 @@ def sum_observations(residuals: Array, J: Array, robust: Robust) -> Equations:
     return Equations(float(losses.sum()), gradient, np.einsum("kmi,kmj->ij", weighted, J))
 
 
-def descend(
+def minimize(
     equations: Callable[[State], Equations],
     move: Callable[[State, Array], State],
     start: State,
@@ -72,7 +74,7 @@ def descend(
         moved = move(state, step)
         after = equations(moved)
         if after.loss > found.loss:
-            damping *= RISE
+            damping *= REFUSED
             if damping > MOST_DAMPING:
                 break
             continue

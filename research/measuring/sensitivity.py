@@ -42,7 +42,7 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
     "evidence.covariance": ("MOST_SCORE", "PIXEL_SHARE", "UNCALIBRATED_SHARE"),
     "evidence.focal_length": ("INFLATION_OF_ALL",),
     "evidence.lens_matches": ("INFLATION", "MATCHED_DEVIATION"),
-    "evidence.verification": ("COS_AGREE", "DISTINCT_RATIO"),
+    "evidence.verification": ("COS_AGREE",),
     "judge.candidate": ("LEAST_SHARED",),
     "judge.selection": (
         "CHANCE_MATCHES",
@@ -62,6 +62,7 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
     "localization.mirror": ("ENOUGH_EXPLAINED",),
     "localization.search": ("CANDIDATES_PER_START", "POSES_PER_START"),
     "problem.settings": ("FIRST_STARTS",),
+    "local_features.matching": ("DISTINCT_RATIO",),
     "local_features.hypotheses": ("MAX_VOTERS", "NUM_CLUSTERS"),
 }
 
