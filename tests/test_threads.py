@@ -218,9 +218,14 @@ def test_an_error_gives_them_back(three_threads):
     assert _threads() == three_threads
 
 
-def test_a_photo_is_localized_with_one(three_threads, monkeypatch):
-    seen = []
-    monkeypatch.setattr(method, "judge", lambda *_: seen.append(_threads()))
+def test_a_photo_is_localized_with_one(three_threads):
+    seen = set()
+
+    def show(values, total, label):
+        seen.add((label, *_threads()))
+        yield from values
+
     settings = CoarseToFineSettings(gravity="known")
-    method.localize(rooms.scan_map(1), rooms.scene(1)[1], settings, Workers(2), Stopwatch())
-    assert seen == [{1}]
+    method.localize(rooms.scan_map(1), rooms.scene(1)[1], settings, Workers(2, show), Stopwatch())
+    assert {("search", 1), ("evaluate", 1)} <= seen
+    assert all(counts == [1] for _, *counts in seen)
