@@ -225,17 +225,10 @@ def test_a_stranger_is_not_localized_by_its_own_paint(tmp_path, monkeypatch):
     assert max(errors) < 0.02
 
 
-def test_the_photos_that_see_a_point_best_are_kept(monkeypatch):
+def test_the_photos_that_see_a_point_best_are_kept():
     rng = np.random.default_rng(5)
     weights = np.maximum(rng.normal(size=(20, 50)), 0.0).astype(np.float32)
-
-    def weigh(points, sight, R_cam_from_map, center_map, found):
-        found[:] = weights[int(center_map[0])]
-
-    monkeypatch.setattr(alignment, "look", lambda octree, pose: None)
-    monkeypatch.setattr(alignment, "weigh_points", weigh)
-    poses = [Pose(np.eye(3), np.array([k, 0.0, 0.0])) for k in range(20)]
-    sightings = alignment.find_sightings(None, np.zeros((50, 3), np.float32), poses, Workers(2))
+    sightings = alignment.keep_best(weights, 50, 20)
     for n in range(50):
         wanted = sorted(k for k in np.argsort(-weights[:, n])[:6] if weights[k, n] > 0.0)
         own = slice(*sightings.first[n : n + 2])

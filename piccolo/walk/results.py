@@ -26,9 +26,10 @@ from ..jobs.threads import Progress, no_progress, one_blas_thread
 from ..judge.decide import decide, take_pose
 from ..problem.prior import contradictions
 from ..problem.problem import Problem
+from .expectation import Expected, Followed
 from .frames import Frame
 from .path import EVEN, Belief, Gap, Path, believe, build_lattice
-from .tracker import Expected, Followed, Tracker, find_near, refine_state
+from .tracker import Tracker, find_near, refine_state
 
 LEAST_WALKED = 2.0  # [m] between frames by which an odometry is checked
 LEAST_RATIOS = 4  # of distances; fewer say nothing
