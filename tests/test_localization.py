@@ -43,13 +43,6 @@ def test_camera_is_found_within_millimetres(seed, variant):
     assert angle_deg < (0.4 if variant in ("photo", "change") else 0.2)
 
 
-@pytest.mark.parametrize("solver", ["adam", "lbfgs"])
-def test_other_solvers_go_on_from_the_same_search(solver):
-    taken = query(1)
-    found = _localize(1, taken.rgb, dataclasses.replace(rooms.KNOWN, solver=solver))
-    assert errors(found.pose, taken.pose)[0] < 0.01
-
-
 def test_same_bits_for_any_number_of_threads():
     one, two = (_localize(1, query(1).rgb, rooms.KNOWN, n) for n in (1, 2))
     assert one.pose.key == two.pose.key
