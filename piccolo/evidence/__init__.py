@@ -1,1 +1,1 @@
-"""What speaks for and against a pose: made here, complete, for those who decide."""
+"""Evidence for and against a pose: made here, complete, for those who decide."""

@@ -36,7 +36,7 @@ class Measured(NamedTuple):
 
 
 class Geometry(NamedTuple):
-    """What was found out about the geometry of a photo by comparing it with the scan."""
+    """The geometry of a photo as it was found by comparing it with the scan."""
 
     cameras: tuple[Mount, ...]  # as found
     doubt: float  # probability that what was given is wrong and has pulled the pose along
@@ -48,7 +48,7 @@ class Geometry(NamedTuple):
 
 
 class Case(NamedTuple):
-    """What the judge reads of a photo."""
+    """All that the judge reads of a photo."""
 
     found: Selection  # with the alternatives that are reported
     standings: tuple[Standing, ...]  # evidence for the best pose and each alternative

@@ -1,4 +1,4 @@
-"""What a photo says of its geometry compared with the scan, and its poses refined with what was found."""
+"""The geometry that a photo claims, compared with the scan, and its poses refined with what was found."""
 
 import math
 from dataclasses import replace

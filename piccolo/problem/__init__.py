@@ -1,1 +1,1 @@
-"""What is asked: a photo's images, a map, and what is known beforehand."""
+"""The question: a photo's images, a map, and what is known beforehand."""

@@ -1,4 +1,4 @@
-"""What differs between photos of the whole sphere and of a part, in scans with colours and by shape alone."""
+"""Differences between photos of the whole sphere and of a part, in scans with colours and by shape alone."""
 
 import math
 from dataclasses import dataclass, replace
@@ -53,7 +53,7 @@ SHAPE_SCALES = ImageScales(fine=ImageScales().fine._replace(blur_px=1.7))
 
 @dataclass(frozen=True)
 class Profile:
-    """How a kind of photo is searched and judged."""
+    """A way to search and judge a kind of photo."""
 
     evidence: EvidenceKind  # with what poses are compared
     is_partial: bool  # the photo shows a part of the sphere

@@ -15,7 +15,7 @@ FIRST_STARTS = 300  # of a brief search: few are enough for a clear photo
 
 
 class Effort(NamedTuple):
-    """How much is searched."""
+    """The amount that is searched."""
 
     num_yaws: int  # rotations with gravity known
     num_rotations: int  # of SO(3), with gravity unknown
@@ -47,7 +47,7 @@ class CoarseToFineSettings:
 
     @property
     def effort(self) -> Effort:
-        """How much is searched."""
+        """The amount that is searched."""
         return Effort(self.num_yaws, self.num_rotations, self.max_starts)
 
     def to_json(self) -> dict[str, object]:

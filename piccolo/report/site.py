@@ -41,7 +41,7 @@ POLICY = (
 OWN = "'self' file:"
 CHI_SQUARE_95 = 5.991  # of two degrees of freedom
 LEAST_CONFIDENCE = 0.05  # of a photo that is not localized: a best guess below it is on no plan
-# beginnings of warnings of localization/prior.py and judge.py
+# beginnings of warnings of problem/prior.py and judge/decide.py
 CONTRADICTIONS = "the pose found is", "the pose found looks", "no position is left", "the picture has a focal"
 ENDING = re.compile(r"\.[A-Za-z0-9]{3,4}( \(\d+\))?$")
 DIGITS = 6  # of positions [m] and rotations

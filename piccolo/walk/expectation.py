@@ -1,4 +1,4 @@
-"""Where a frame is expected, from where it is tracked, and which end counts: decisions on values."""
+"""Decisions on values: where a frame is expected, from where it is tracked, and which end counts."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
