@@ -231,10 +231,10 @@ class Short(module.Localizer):
         scan = super().open_scan(workers)
         ask = type(scan).localize
 
-        def localize(self, photo, *more):
+        def localize(self, photo, *more, **noted):
             if error := Short.errors.pop(photo.path.name, None):
                 raise error
-            return ask(self, photo, *more)
+            return ask(self, photo, *more, **noted)
 
         return type("Scan", (type(scan),), {"localize": localize})(**vars(scan))
 

@@ -152,10 +152,10 @@ def looked(monkeypatch):
     """What is looked at again; b and d are not sure before, and d is not after."""
     ask, known, looked = OpenedScan.localize, {}, Looked([], {})
 
-    def localize(self, photo, *more):
+    def localize(self, photo, *more, **noted):
         content = photo.path.read_bytes()
         if content not in known:
-            known[content] = ask(self, photo, *more)
+            known[content] = ask(self, photo, *more, **noted)
         found = replace(known[content], pano=photo.name)
         is_sure = photo.path.name not in ("b.jpg", "d.jpg")
         status = found.status if is_sure else "ambiguous"

@@ -15,7 +15,7 @@ import pytest
 from refusals import fill_disk
 
 from piccolo.cli import terminal
-from piccolo.files import atomic, cache
+from piccolo.files import cache
 from piccolo.files.atomic import PREFIX, replacing, temporary_folder
 from piccolo.kernels import jit
 from piccolo.kernels.jit import kernel
@@ -26,13 +26,19 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture
-def folders(tmp_path, monkeypatch):
+def temporary(tmp_path, monkeypatch):
+    """The folder for temporary files."""
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    return tmp_path / "tmp"
+
+
+@pytest.fixture
+def folders(tmp_path, home_cache, temporary, monkeypatch):
     """The user's cache folder, which can't be made, and the one for temporary files."""
     (tmp_path / "file").touch()
-    (tmp_path / "tmp").mkdir()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
-    return tmp_path / "file", tmp_path / "tmp"
+    return tmp_path / "file", temporary
 
 
 def _root():
@@ -91,9 +97,6 @@ def test_a_users_cache_that_others_may_write_to_is_told_and_left(
 
 @pytest.mark.parametrize("how", ["open to the group", "a file", "no place", "full disk"])
 def test_where_no_kernel_can_be_kept_one_warning_says_so(folders, tmp_path, monkeypatch, caplog, how):
-    jit.warn_not_kept.cache_clear()
-    monkeypatch.setattr(jit, "kernel_folder", jit.kernel_folder.__wrapped__)
-    monkeypatch.setattr(jit, "cache_root", cache.cache_root.__wrapped__)
     root = _root()
     if how == "open to the group":
         (root / "kernels").mkdir()
@@ -147,15 +150,15 @@ def test_only_stale_files_of_ours_go_and_only_from_a_folder_that_is_marked(tmp_p
     assert not (tmp_path / "foreign" / "CACHEDIR.TAG").exists()
 
 
-def test_damaged_compiled_code_is_noticed_and_made_anew(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(jit, "kernel_folder", lambda: tmp_path)
+def test_damaged_compiled_code_is_noticed_and_made_anew(home_cache, caplog):
+    folder = home_cache / "kernels"
 
     def total(values):
         return values.sum()
 
     values = np.arange(5.0)
     assert kernel(total)(values) == 10.0
-    (path,) = tmp_path.iterdir()
+    (path,) = folder.glob("*.kernel")
     whole = path.read_bytes()
     os.utime(path, (0, 0))
     loaded = kernel(total)
@@ -168,7 +171,7 @@ def test_damaged_compiled_code_is_noticed_and_made_anew(tmp_path, monkeypatch, c
     assert sum(anew.stats.cache_misses.values()) == 1
     assert kernel(total)(values) == 10.0  # it was written anew
     text = "damaged compiled code; it is compiled again"
-    assert [record.getMessage() for record in caplog.records] == [f"{tmp_path}: {text}"]
+    assert [record.getMessage() for record in caplog.records] == [f"{folder}: {text}"]
     other = path.with_name(32 * "0" + ".kernel")
     damaged = [b"", whole[: jit.DIGEST_SIZE], whole[:-1], whole + b"0"]
     for bit in np.random.default_rng(0).integers(8 * len(whole), size=300):
@@ -179,12 +182,10 @@ def test_damaged_compiled_code_is_noticed_and_made_anew(tmp_path, monkeypatch, c
         place.write_bytes(content)
         assert jit.read_whole(place) is None
     assert len(caplog.records) == 1  # however many are damaged
-    assert jit.read_whole(tmp_path / "none") is None
+    assert jit.read_whole(folder / "none") is None
 
 
-def test_a_kernel_is_compiled_with_another_that_was_loaded(tmp_path, monkeypatch):
-    monkeypatch.setattr(jit, "kernel_folder", lambda: tmp_path)
-
+def test_a_kernel_is_compiled_with_another_that_was_loaded(home_cache):
     def scaled_sum(values, factor):
         return factor * values.sum()
 
@@ -213,12 +214,10 @@ def test_a_kernel_is_compiled_with_another_that_was_loaded(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("fails", ["rebuild", "serialize"])
-def test_where_numba_is_not_as_it_was_kernels_are_compiled(tmp_path, monkeypatch, caplog, fails):
+def test_where_numba_is_not_as_it_was_kernels_are_compiled(home_cache, monkeypatch, caplog, fails):
     def total(values):
         return values.sum()
 
-    jit.warn_not_kept.cache_clear()
-    monkeypatch.setattr(jit, "kernel_folder", lambda: tmp_path)
     values = np.arange(5.0)
     if fails == "rebuild":
         kernel(total)(values)
@@ -229,17 +228,16 @@ def test_where_numba_is_not_as_it_was_kernels_are_compiled(tmp_path, monkeypatch
     assert warning.endswith("compiled code is not kept, and each run takes half a minute longer")
 
 
-def test_bounds_are_checked_where_code_without_is_kept(tmp_path, monkeypatch):
+def test_bounds_are_checked_where_code_without_is_kept(home_cache, monkeypatch):
     def third(values):
         return values[2]
 
-    monkeypatch.setattr(jit, "kernel_folder", lambda: tmp_path)
     values = np.zeros(3)
     kernel(third)(values)
     monkeypatch.setattr(numba.config, "BOUNDSCHECK", 1)
     with pytest.raises(IndexError):
         kernel(third)(values[:2])
-    assert len(list(tmp_path.iterdir())) == 2
+    assert len(list((home_cache / "kernels").glob("*.kernel"))) == 2
 
 
 def test_losses_of_one_making_are_kept_apart_on_disk():
@@ -286,10 +284,9 @@ with temporary_folder() as folder:
 
 
 @pytest.fixture
-def temporary_folders(tmp_path, monkeypatch):
+def temporary_folders(temporary):
     """A function that lists the temporary folders there are."""
-    monkeypatch.setattr(atomic.tempfile, "tempdir", str(tmp_path))
-    return lambda: [path for path in tmp_path.iterdir() if path.name.startswith(PREFIX)]
+    return lambda: [path for path in temporary.iterdir() if path.name.startswith(PREFIX)]
 
 
 def test_a_folder_is_removed_at_the_end_and_after_an_error(temporary_folders):
@@ -301,17 +298,17 @@ def test_a_folder_is_removed_at_the_end_and_after_an_error(temporary_folders):
     assert temporary_folders() == []
 
 
-def test_what_a_killed_process_left_is_removed_and_what_a_living_one_has_stays(temporary_folders, tmp_path):
+def test_what_a_killed_process_left_is_removed_and_what_a_living_one_has_stays(temporary_folders, temporary):
     command = [sys.executable, "-c", HOLD]
-    where = os.environ | {"TMPDIR": str(tmp_path)}
+    where = os.environ | {"TMPDIR": str(temporary)}
     with subprocess.Popen(command, env=where, stdout=subprocess.PIPE, text=True) as process:
-        folder = tmp_path / process.stdout.readline().strip()
+        folder = temporary / process.stdout.readline().strip()
         os.utime(folder, (time.time() - 60, time.time() - 60))
         with temporary_folder():
             assert folder in temporary_folders()
         process.kill()
-    (tmp_path / f"{PREFIX}12345678").symlink_to(tmp_path)
-    (tmp_path / f"{PREFIX}87654321").mkdir()  # made a moment ago
+    (temporary / f"{PREFIX}12345678").symlink_to(temporary)
+    (temporary / f"{PREFIX}87654321").mkdir()  # made a moment ago
     with temporary_folder() as own:
         others = {f"{PREFIX}12345678", f"{PREFIX}87654321"}
         assert {path.name for path in temporary_folders()} == {own.name, *others}

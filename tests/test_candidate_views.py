@@ -12,9 +12,10 @@ from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
 from piccolo.panorama.local_normalization import LEVELS_PER_UNIT
 from piccolo.problem.profile import VIEWS
-from piccolo.views import candidate_views, points_around
+from piccolo.views import points_around
 from piccolo.views.candidate_views import SEARCH_VIEW, CandidateViews, render_views, render_wide
 from piccolo.views.points_around import visible_points
+from piccolo.views.view import average_view
 
 ALL = np.ones(len(make_grid(24)), bool)
 
@@ -36,26 +37,24 @@ def test_views_are_views_in_few_bits():
     np.testing.assert_allclose(views.features[row] / LEVELS_PER_UNIT, features, atol=0.01)
 
 
-def test_views_are_made_once_whatever_is_asked_for(monkeypatch):
+def test_views_are_made_once_whatever_is_asked_for():
     m, kept = _views()
-    monkeypatch.setattr(candidate_views, "LEAST_ROOM", 1)
-    asked, made = [], candidate_views.render_views
-    monkeypatch.setattr(candidate_views, "render_views", lambda *how: asked.append(len(how[1])) or made(*how))
     rng = np.random.default_rng(0)
     for _ in range(20):
         candidates = rng.integers(len(m.centers), size=30)
         rows, views = kept.at(candidates, Workers(2))
         np.testing.assert_array_equal(views.centers[rows], m.centers[candidates])
-    assert sum(asked) == kept.num_made == len(np.unique(kept.made.centers[: kept.num_made], axis=0))
+    assert kept.num_made == len(np.unique(kept.made.centers[: kept.num_made], axis=0))
     rows, views = kept.at(np.arange(len(m.centers)), Workers(2))
-    for found, expected in zip(views, made(m.octree, m.centers, SEARCH_VIEW, Workers(1)), strict=True):
+    for found, expected in zip(
+        views, render_views(m.octree, m.centers, SEARCH_VIEW, Workers(1)), strict=True
+    ):
         np.testing.assert_array_equal(found[rows], expected)
 
 
-def test_no_more_than_so_many_are_kept_and_those_given_out_stay(monkeypatch):
-    m, kept = _views()
-    monkeypatch.setattr(candidate_views, "MOST_KEPT", 40)
-    monkeypatch.setattr(candidate_views, "LEAST_ROOM", 1)
+def test_no_more_than_so_many_are_kept_and_those_given_out_stay():
+    m, _ = _views()
+    kept = CandidateViews(m.octree, m.centers, most_kept=40)
     rng, given = np.random.default_rng(0), []
     for count in (30, 30, 5, 60, 60, 10):
         candidates = rng.choice(len(m.centers), count, replace=False)
@@ -119,24 +118,16 @@ def _problem():
     return rooms.ask(rooms.scene(1)[1], rooms.scan_map(1))
 
 
-def test_poses_near_one_place_share_what_is_drawn_and_no_others(monkeypatch):
-    problem, drawn = _problem(), []
-    octree = problem.scan_map.octree
-
-    def average_view(octree, place, config):
-        drawn.append((place, config))
-        return original(octree, place, config)
-
-    original = points_around.average_view
-    monkeypatch.setattr(points_around, "average_view", average_view)
+def test_poses_near_one_place_share_what_is_drawn_and_no_others():
+    octree = rooms.scan_map(1).octree
     views = points_around.RecentViews(octree)
     here, near, far = _pose(0.296, 0.2, 0.3), _pose(0.304, 0.197, 0.304), _pose(0.306, 0.2, 0.3)
     places = [points_around.round_position(pose) for pose in (here, near, far)]
     assert places[0] == places[1] != places[2]
     sums = [views.averages(place, FINE) for place in places]
     assert sums[0] is sums[1]
-    assert len(drawn) == 2
-    np.testing.assert_array_equal(sums[0], original(octree, places[0], FINE))
+    assert views.averages.cache_info().misses == 2
+    np.testing.assert_array_equal(sums[0], average_view(octree, places[0], FINE))
     for k in range(points_around.NUM_VIEWS):
         views.averages((0.01 * k, 0.5, 0.3), FINE)
     assert views.averages(places[0], FINE) is not sums[0]  # only the last are kept

@@ -279,20 +279,25 @@ def test_memory_grows_with_the_scene_and_not_with_the_points():
 
 
 @pytest.mark.parametrize("preset", [rooms.AUTO, PaperSettings()])
-def test_a_wrong_unit_is_told_before_the_long_work_begins(tmp_path, monkeypatch, preset):
+def test_a_wrong_unit_is_told_before_the_long_work_begins(tmp_path, preset):
     heard = []
+    done = []
 
-    def begin(*_):
+    def warn(warning):
+        heard.append(warning)
         raise InterruptedError
 
-    monkeypatch.setattr("piccolo.scan_map.scan_map.candidate_centers", begin)
-    monkeypatch.setattr("piccolo.opening.prepare_by_paper", begin)
+    def show(values, total, label):
+        done.append(label)
+        yield from values
+
     path = tmp_path / "mm.xyz"
     raw = seeded_cloud(1, 1500, size=(6000.0, 5000.0, 2500.0))
     np.savetxt(path, np.hstack([raw.points_world, raw.colors]), fmt="%.3f")
-    no_cache, workers = CachePolicy(is_used=False), Workers(1, warn=heard.append)
+    no_cache, workers = CachePolicy(is_used=False), Workers(1, show, warn)
     with pytest.raises(InterruptedError):
         open_files([path], CloudSettings(), preset, no_cache, workers)
     (warning,) = heard
     assert warning.startswith(f"{path}: the cloud spans")
     assert warning.endswith("set `units` to mm")
+    assert done == ["read mm.xyz"]

@@ -75,15 +75,23 @@ def test_a_cluster_loses_a_worker_is_interrupted_and_goes_on(scene, machines, tm
     assert untimed(out) == untimed(whole)
 
 
+@pytest.fixture
+def unshared(monkeypatch):
+    """Let workers have none of the files."""
+    monkeypatch.setattr(cluster.Cluster, "has_files", lambda *_: False)
+
+
 @pytest.mark.parametrize("shared", [True, False])
-def test_workers_elsewhere_open_the_scan_or_are_sent_it(scene, scheduler, tmp_path, monkeypatch, shared):
+def test_workers_elsewhere_open_the_scan_or_are_sent_it(
+    scene, scheduler, tmp_path, monkeypatch, request, shared
+):
     monkeypatch.chdir(scene)
     preset = ["--gravity", "known"]
     words = ["--cloud", "cloud.ply", "--pano", "missing.jpg", *PANOS[:3], "--quiet", *preset]
     whole, out = tmp_path / "whole.jsonl", tmp_path / "poses.jsonl"
     assert localize.main([*words, "--out", str(whole), "--jobs", "1"]) == 3
     if not shared:
-        monkeypatch.setattr(cluster.Cluster, "has_files", lambda *_: False)
+        request.getfixturevalue("unshared")
     assert localize.main([*words, "--out", str(out), "--dask", str(scheduler)]) == 3
     assert untimed(out) == untimed(whole)
     assert list(scheduler.parent.rglob("*.piccolo-map")) == []  # what was sent is gone
@@ -92,14 +100,14 @@ def test_workers_elsewhere_open_the_scan_or_are_sent_it(scene, scheduler, tmp_pa
         assert localize.main([*paper, "--overwrite", "--out", str(out), "--dask", str(scheduler)]) == 3
 
 
-def test_an_evaluation_on_a_cluster_gives_the_same(scene, scheduler, tmp_path, monkeypatch, capsys):
+def test_an_evaluation_on_a_cluster_gives_the_same(scene, scheduler, tmp_path, monkeypatch, request, capsys):
     monkeypatch.chdir(scene.parent)
     words = ["--scenes", scene.name, "--quiet", *PAPER]
     outs = [tmp_path / name for name in ("whole.jsonl", "run.jsonl")]
     for out, more in zip(outs, ([], ["--dask", str(scheduler)]), strict=True):
         assert evaluate.main([*words, "--out", str(out), *more]) == 0
     assert untimed(outs[0]) == untimed(outs[1])
-    monkeypatch.setattr(cluster.Cluster, "has_files", lambda *_: False)
+    request.getfixturevalue("unshared")
     assert evaluate.main([*words, "--out", str(tmp_path / "c"), "--dask", str(scheduler)]) == 3
     assert "not all workers can read" in capsys.readouterr().err
 

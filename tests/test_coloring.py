@@ -31,6 +31,7 @@ from piccolo.coloring.color_scan import (
 from piccolo.errors import InputError, ResourceError
 from piccolo.files.line_file import Journal
 from piccolo.geometry.pose import Pose, pose_errors, step
+from piccolo.jobs.memory import memory_taken
 from piccolo.jobs.threads import Workers
 from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.panorama import Panorama
@@ -224,17 +225,10 @@ def test_a_stranger_is_not_localized_by_its_own_paint(tmp_path, monkeypatch):
     assert max(errors) < 0.02
 
 
-def test_the_photos_that_see_a_point_best_are_kept(monkeypatch):
+def test_the_photos_that_see_a_point_best_are_kept():
     rng = np.random.default_rng(5)
     weights = np.maximum(rng.normal(size=(20, 50)), 0.0).astype(np.float32)
-
-    def weigh(points, sight, R_cam_from_map, center_map, found):
-        found[:] = weights[int(center_map[0])]
-
-    monkeypatch.setattr(alignment, "look", lambda octree, pose: None)
-    monkeypatch.setattr(alignment, "weigh_points", weigh)
-    poses = [Pose(np.eye(3), np.array([k, 0.0, 0.0])) for k in range(20)]
-    sightings = alignment.find_sightings(None, np.zeros((50, 3), np.float32), poses, Workers(2))
+    sightings = alignment.keep_best(weights, 50, 20)
     for n in range(50):
         wanted = sorted(k for k in np.argsort(-weights[:, n])[:6] if weights[k, n] > 0.0)
         own = slice(*sightings.first[n : n + 2])
@@ -243,12 +237,11 @@ def test_the_photos_that_see_a_point_best_are_kept(monkeypatch):
     assert all((sightings.photo[own] == k).all() for k, own in enumerate(sightings.own))
 
 
-def test_colours_that_need_too_much_memory_are_refused(tmp_path, monkeypatch):
+def test_colours_that_need_too_much_memory_are_refused(tmp_path, limiting):
     scan_map = _gray_map(rooms.room(SEED)[1])
     one = rooms.query(SEED)
     results = [_result(tmp_path / "0.png", one.rgb, one.pose)] * 2
-    monkeypatch.setattr("piccolo.jobs.memory.memory_left", lambda: 4e6)
-    monkeypatch.setattr("piccolo.jobs.memory.KNOWN", [])
+    limiting(memory_taken() / 1e9 + 0.004)
     with pytest.raises(ResourceError, match=r"^colouring by 2 photos needs .* localize fewer at once"):
         make_aligned_brushes(scan_map, results, Workers(1))
     points = np.zeros((100_000, 3))
@@ -352,13 +345,12 @@ def test_a_colouring_that_is_stopped_twice_goes_on_with_the_same_bits(
         steps.append(step)
         append(self, step, text)
 
+    monkeypatch.setattr(Journal, "append", count)
     for num_kept in (1, 5):
-        with monkeypatch.context() as patched:
-            patched.setattr(Journal, "append", count)
-            assert command_line.main(_words(files, out)) == 3
+        assert command_line.main(_words(files, out)) == 3
         assert steps_file(out.with_suffix(".jsonl")).exists()
         assert len(steps) == num_kept
-    monkeypatch.setattr(Journal, "append", lambda *given: steps.append(given[1]) or append(*given))
+    num_kept = None
     assert command_line.main(_words(files, out)) == 0
     assert len(steps) == 6
     assert "of the points coloured" in capsys.readouterr().err

@@ -26,6 +26,7 @@ from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import localize as module
 from piccolo.localization.calibration import follow_matches, recalibrate
 from piccolo.localization.localize import select_likeliest
+from piccolo.localization.means import Trace
 from piccolo.panorama import read_panorama
 from piccolo.photo import Photo
 from research.synthetic.world import render_picture
@@ -199,13 +200,15 @@ def test_the_same_place_by_another_focal_length_is_no_alternative_and_none_is_li
     assert rival.probability == pytest.approx(0.95 * 0.9 / 1.85, rel=0.1)
 
 
-def test_the_first_sure_guess_ends_the_search(monkeypatch):
-    statuses = iter(["not_localized", "localized"])
-    here = Pose(np.eye(3), np.zeros(3))
-    monkeypatch.setattr(module, "localize", lambda *_: Localization(next(statuses), pose=here))
-    panorama = _panorama(_photo(pinhole(320, 240, TRUE))[0], focal_px=TRUE, refine_focal=True)
-    module.localize_guessed(rooms.scan_map(SEED), panorama, rooms.AUTO, Workers(1), Stopwatch())
-    assert not list(statuses)
+@pytest.mark.parametrize("is_blank", [False, True])
+def test_the_first_sure_guess_ends_the_search(is_blank):
+    rgb, _ = _photo(pinhole(320, 240, TRUE))
+    panorama = _panorama(np.full_like(rgb, 128) if is_blank else rgb, focal_px=TRUE, refine_focal=True)
+    scan_map = rooms.scan_map(SEED, DENSE)
+    trace = Trace(is_wanted=True)
+    found = module.localize_guessed(scan_map, panorama, rooms.KNOWN, rooms.WORKERS, Stopwatch(), trace)
+    num_searched = [made["step"] for made in trace.steps].count("refined")
+    assert (found.status, num_searched) == (("not_localized", 3) if is_blank else ("localized", 1))
 
 
 def test_a_retaken_sphere_is_the_one_of_that_calibration_and_keeps_its_mask(tmp_path):

@@ -12,6 +12,8 @@ from batches import PAPER, start_localize, untimed, wait_for_lines, workers_of
 
 from piccolo.batch.localizer import Localizer
 from piccolo.cli import execution, localize, settings
+from piccolo.jobs.memory import memory_taken
+from piccolo.jobs.threads import num_cores
 from piccolo.result import Result, read_results
 
 
@@ -135,20 +137,22 @@ def test_names_on_standard_input_are_answered_as_they_come(scene):
         assert "Fatal" not in process.stderr.read()
 
 
-def test_as_many_processes_as_are_worth_it_and_fit(monkeypatch):
-    monkeypatch.setattr(execution, "num_cores", lambda: 4)
+def test_as_many_processes_as_are_worth_it_and_fit():
+    most = num_cores()
 
     def wanted(num_left, jobs=None, threads=None):
         return execution.count_jobs(argparse.Namespace(jobs=jobs, threads=threads), num_left)
 
-    assert [wanted(count) for count in (1, 15, 16, 31, 32, 1000, None)] == [1, 1, 2, 3, 4, 4, 1]
+    assert [wanted(count) for count in (1, 15, 16, 31, None)] == [1, 1, min(2, most), min(3, most), 1]
+    assert wanted(100 * most) == most
     given = wanted(1000, threads=2), wanted(3, jobs=8), wanted(None, jobs=8), wanted(0, jobs=2)
     assert given == (1, 3, 8, 2)
-    monkeypatch.setattr(execution, "memory_taken", lambda: 1.5e9)
-    monkeypatch.setattr(execution, "memory_left", lambda: 4.6e9)
-    assert execution.count_fitting(argparse.Namespace(jobs=None), 8) == 3
+    assert execution.count_in_memory(1.5e9, 4.6e9) == 3
+    assert execution.count_in_memory(1.5e9, 1e8) == 1
+    assert execution.count_fitting(argparse.Namespace(jobs=None), 1) == 1
     assert execution.count_fitting(argparse.Namespace(jobs=8), 8) == 8
     arguments = argparse.Namespace(jobs=2, threads=None, max_memory=5.5, dask=None)
     localizer = Localizer((), None, None, None, None)
     share = execution.share_of_a_job(arguments, localizer, 2)
-    assert (share.num_threads, share.max_memory) == (2, 2.0)
+    assert share.num_threads == max(1, most // 2)
+    assert share.max_memory == pytest.approx((5.5 - memory_taken() / 1e9) / 2.0, rel=0.01)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from piccolo.files.atomic import hold_lock, write_atomically
-from piccolo.kernels import ahead, jit
+from piccolo.kernels import ahead
 from piccolo.kernels.jit import kernel
 
 ROOT = Path(__file__).parents[1]
@@ -67,9 +67,8 @@ def test_the_list_has_what_photos_ask_for():
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(jit, "kernel_folder", lambda: tmp_path)
-    return tmp_path
+def folder(home_cache):
+    return home_cache / "kernels"
 
 
 def total(values):
@@ -79,7 +78,7 @@ def total(values):
 def test_a_kernel_that_another_process_compiles_is_waited_for(folder):
     values = np.arange(5.0)
     kernel(total)(values)
-    (path,) = folder.iterdir()
+    (path,) = folder.glob("*.kernel")
     whole = path.read_bytes()
     path.unlink()
     waiting = kernel(total)
@@ -96,23 +95,23 @@ def test_a_kernel_that_another_process_compiles_is_waited_for(folder):
     assert value == 10.0
     assert end > released
     assert sum(waiting.stats.cache_hits.values()) == 1
-    assert list(folder.iterdir()) == [path]
+    assert list(folder.glob("*.kernel")) == [path]
 
 
-def test_helpers_compile_what_nobody_has_begun(folder, monkeypatch):
+def test_helpers_compile_what_nobody_has_begun(folder):
     def doubled(values):
         return 2.0 * values.sum()
 
     first = kernel(total)
     second = kernel(doubled)
     arguments = ahead.parse("float64[1C]")
-    monkeypatch.setattr(ahead, "list_kernels", lambda: iter([(first, arguments), (second, arguments)]))
+    both = [(first, arguments), (second, arguments)]
     codegen = ahead.cpu_target.target_context.codegen()
     paths = [each._cache.file(arguments, codegen) for each in (first, second)]
     with hold_lock(paths[0]):
-        ahead.compile_listed()
+        ahead.compile_missing(both)
         assert [path.exists() for path in paths] == [False, True]
-    ahead.compile_listed()
+    ahead.compile_missing(both)
     assert [path.exists() for path in paths] == [True, True]
 
 

@@ -43,13 +43,6 @@ def test_camera_is_found_within_millimetres(seed, variant):
     assert angle_deg < (0.4 if variant in ("photo", "change") else 0.2)
 
 
-@pytest.mark.parametrize("solver", ["adam", "lbfgs"])
-def test_other_solvers_go_on_from_the_same_search(solver):
-    taken = query(1)
-    found = _localize(1, taken.rgb, dataclasses.replace(rooms.KNOWN, solver=solver))
-    assert errors(found.pose, taken.pose)[0] < 0.01
-
-
 def test_same_bits_for_any_number_of_threads():
     one, two = (_localize(1, query(1).rgb, rooms.KNOWN, n) for n in (1, 2))
     assert one.pose.key == two.pose.key
@@ -143,11 +136,10 @@ def test_a_scan_too_large_is_refused_or_prepared_where_the_prior_says(monkeypatc
     center = whole.centers[0]
     is_near = np.linalg.norm(whole.centers - center, axis=1) <= 1.0
     num = len(find_supported_cells(top_surfaces(whole.octree)))
-    for most in (num - 1, 10):  # known when all have been counted, or from the surfaces alone
+    for most in (10, num - 1):  # known from the surfaces alone, or when all have been counted
         monkeypatch.setattr(camera_positions, "MAX_POSITIONS", most)
         with pytest.raises(InputError, match=rf"more than {most} camera positions, .*`units`, .*`near`"):
             prepare_map(cloud, Workers(1))
-    monkeypatch.setattr(camera_positions, "MAX_POSITIONS", num - 1)
     prior = Prior(near=tuple(center + whole.origin_world), radius=1.0)
     said = []
     part = prepare_map(cloud, Workers(1, warn=said.append), prior=prior)

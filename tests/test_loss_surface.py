@@ -101,7 +101,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture
 def run(scene, capsys, monkeypatch):
-    for name, value in {"NUM_YAWS": 24, "MAX_POINTS": 3000, "WIDTH": 128}.items():
+    for name, value in {"NUM_YAWS": 24, "NUM_ROTATIONS": 30, "MAX_POINTS": 3000, "WIDTH": 128}.items():
         monkeypatch.setattr(tool, name, value)
 
     def call(*arguments, pano="clean_0.jpg"):
@@ -125,8 +125,7 @@ def test_picture_of_a_tilted_panorama(run, scene, tmp_path):
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
 
 
-def test_without_a_pose_known(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(tool, "NUM_ROTATIONS", 30)
+def test_without_a_pose_known(run, tmp_path):
     code, told, _ = run("--step", 1.0, "--gravity", "unknown", "--out", tmp_path / "b.png")
     assert (code, told["poses"]) == (0, np.prod(told["places"]) * 5 * 30)
 

@@ -44,9 +44,7 @@ def test_default_is_a_part_of_what_is_free_and_a_limit_counts_what_is_taken(limi
     limiting(memory.memory_taken() / 1e9 + 0.2)
     assert memory.memory_left() == pytest.approx(2e8, rel=0.02)
     memory.check_memory(1.9e8, "a", "b")
-    with pytest.raises(
-        InputError, match=r"^the grid needs 0.21 GB of memory, 0.2 GB may be used; cut it, or"
-    ):
+    with pytest.raises(InputError, match=r"^the grid needs 0.21 GB of memory, 0.2 GB may be used; cut it"):
         memory.check_memory(2.1e8, "the grid", "cut it")
     for wrong in (0.0, -1.0, float("nan")):
         assert_input_error("`max_memory`: found", limiting, wrong)

@@ -115,13 +115,9 @@ def test_a_cache_that_can_not_be_used_is_a_warning(cloud, tmp_path, monkeypatch,
 
 
 @pytest.fixture
-def facts(tmp_path, monkeypatch):
-    folder = tmp_path / "facts"
-    for each in (folder, tmp_path / "maps"):
-        each.mkdir(mode=0o700)
-    monkeypatch.setattr(cache, "private_folder", lambda *_: folder)
-    monkeypatch.setattr(map_file, "private_folder", lambda *_: tmp_path / "maps")
-    return folder
+def facts(home_cache):
+    """The folder of facts."""
+    return cache.private_folder("facts", cache.FACT_NAME)
 
 
 def test_a_fact_holds_until_its_file_changes_in_any_way(facts, tmp_path):
@@ -141,25 +137,25 @@ def test_a_fact_holds_until_its_file_changes_in_any_way(facts, tmp_path):
 def test_facts_that_can_not_be_kept_or_read_are_lost(facts, tmp_path, monkeypatch):
     status = tmp_path.stat()
     cache.remember("what", status, "a fact")
-    (kept,) = facts.iterdir()
+    (kept,) = facts.glob("*.fact")
     kept.write_bytes(b"\xff\xff")
     assert cache.recall("what", status) is None
     monkeypatch.setattr(cache, "write_atomically", fill_disk)
     cache.remember("other", status, "a fact")
-    monkeypatch.setattr(cache, "private_folder", lambda *_: None)
+    facts.chmod(0o777)
+    cache.private_folder.cache_clear()
     cache.remember("more", status, "a fact")
     assert cache.recall("more", status) is None
-    assert [entry.name for entry in facts.iterdir()] == [kept.name]
+    assert list(facts.glob("*.fact")) == [kept]
 
 
-def test_facts_are_kept_where_nobody_else_can_write(tmp_path, monkeypatch):
-    monkeypatch.setattr(cache, "cache_root", lambda: tmp_path)
+def test_facts_are_kept_where_nobody_else_can_write(home_cache):
     kept = cache.private_folder.__wrapped__
-    assert kept("facts", cache.FACT_NAME) == tmp_path / "facts"
-    assert (tmp_path / "facts").stat().st_mode & 0o777 == 0o700
-    (tmp_path / "facts").chmod(0o777)
+    assert kept("facts", cache.FACT_NAME) == home_cache / "facts"
+    assert (home_cache / "facts").stat().st_mode & 0o777 == 0o700
+    (home_cache / "facts").chmod(0o777)
     assert kept("facts", cache.FACT_NAME) is None
-    (tmp_path / "file").touch()
+    (home_cache / "file").touch()
     assert kept("file", cache.FACT_NAME) is None
 
 
@@ -169,12 +165,11 @@ def test_a_digest_is_taken_once_and_anew_when_the_file_changes(facts, tmp_path, 
     path.write_bytes(b"one")
     of_file = hashlib.file_digest
     monkeypatch.setattr(hashlib, "file_digest", lambda *args: read.append(args) or of_file(*args))
-    monkeypatch.setattr(cache, "TICK_NS", 10**15)
-    assert cache.sha256_of_files([path], True) == hashlib.sha256(b"one").hexdigest()
-    assert list(facts.iterdir()) == []  # it has changed just now, and may once more
-    monkeypatch.setattr(cache, "TICK_NS", -(10**15))
-    for _ in range(2):
+    for tick, num_kept in ((10**15, 0), (-(10**15), 1)):  # at first it may change once more
+        monkeypatch.setattr(cache, "TICK_NS", tick)
         assert cache.sha256_of_files([path], True) == hashlib.sha256(b"one").hexdigest()
+        assert len(list(facts.glob("*.fact"))) == num_kept
+    assert cache.sha256_of_files([path], True) == hashlib.sha256(b"one").hexdigest()
     assert len(read) == 2
     assert cache.sha256_of_files([path]) == hashlib.sha256(b"one").hexdigest()
     assert len(read) == 3

@@ -15,14 +15,13 @@ from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose import Pose, step
 from piccolo.geometry.sphere import make_grid
 from piccolo.jobs.threads import Workers
-from piccolo.judge.alternatives import Hypothesis
 from piccolo.judge.candidate import CONTRADICTS, Comparison
 from piccolo.localization import beam, ladder
 from piccolo.localization.beam import best_and_alternatives, narrow
 from piccolo.localization.search import Starts
 from piccolo.optimize.channel_loss import NUM_BLOCKS
 from piccolo.problem.profile import VIEWS, WHOLE_BEAM
-from piccolo.problem.stages import AROUND_MIDDLE, FINE, FULL, LAST, NEARLY, SECOND, Limits, Rounds
+from piccolo.problem.stages import AROUND_FINE, AROUND_MIDDLE, FULL, LAST, NEARLY, SECOND, Limits, Rounds
 from piccolo.views.points_around import round_position
 from piccolo.views.view import Cells
 
@@ -103,28 +102,19 @@ def test_the_beam_narrows_from_stage_to_stage():
     ("gains", "rounds", "expected"),
     [([0.2, 0.02, 0.005, 1], 3, 0.725), ([0.1] * 9, 5, 1.0), ([-0.3, 0.5], 1, 0.5), ([0.1, -0.1, 1], 2, 0.6)],
 )
-def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, rounds, expected):
-    left, sizes = list(gains), []
+def test_poses_are_perturbed_for_as_long_as_that_helps(gains, rounds, expected):
+    scores = list(0.5 + np.cumsum(gains))
+    asked = []
 
-    def around(problem, cells, pose, stage, workers):
-        sizes.append(stage.around.size)
-        assert (stage.around.image, stage.image) == ("middle", "fine")
-        return Hypothesis(pose, score[0])
+    def perturb(best):
+        asked.append(best.score)
+        return at(float(len(asked)), scores[len(asked) - 1])
 
-    def fine(problem, pose, workers, stage):
-        assert stage is FINE
-        score[0] += left.pop(0)
-        return Hypothesis(pose, score[0])
-
-    score = [0.5]
-    monkeypatch.setattr(ladder, "score_on_cells", lambda *_: at(0.0, 0.5))
-    monkeypatch.setattr(ladder, "descend_around", around)
-    monkeypatch.setattr(ladder, "refine", fine)
-    asked = SimpleNamespace(view_at=lambda *_: None, photo=SimpleNamespace(image=lambda name: name))
-    found = ladder.climb(asked, at(0.0, 0.9).pose, ALONE)
+    found = ladder.climb_by(perturb, at(0.0, 0.5))
     assert found.score == pytest.approx(expected)
-    assert found.is_climbed
-    assert sizes == [0.4] * rounds
+    assert len(asked) == rounds
+    assert asked == sorted(asked)
+    assert (AROUND_FINE.around.image, AROUND_FINE.image, AROUND_FINE.around.size) == ("middle", "fine", 0.4)
 
 
 def test_what_has_climbed_climbs_no_more():
@@ -153,8 +143,8 @@ def test_occluders_are_masked_again_where_that_gains(monkeypatch, is_masked, sco
         made.append(start.unoccluded.photo)
         return replace(move(start, 1.0), score=scores[len(made)])
 
-    monkeypatch.setattr(ladder, "climb_masked", climb)
-    monkeypatch.setattr(ladder, "climb_whole", climb)
+    for name in ("climb_masked", "climb_whole"):
+        monkeypatch.setattr(ladder, name, climb)
     start = replace(make_candidate(0.0, scores[0]), seen=seen)
     found = ladder.climb_unoccluded(replace(PROBLEM, photo=whole), start, ALONE)
     assert made == ["masked" if is_masked else whole] * rounds

@@ -64,7 +64,6 @@ PIXELS = np.zeros((64, 128, 3), np.uint8)
         (lambda: piccolo.Prior(heading_deg="12"), "`heading_deg`: found '12', wanted a number"),
         (lambda: piccolo.Prior(use_gps=1), "`use_gps`: found 1, wanted True or False"),
         (lambda: piccolo.Prior(height=(2.0, 1.0)), r"`height`: found \[2.0, 1.0\], wanted MIN below MAX"),
-        (lambda: CoarseToFineSettings(solver="newton"), "`solver`: found 'newton', wanted one of"),
     ],
 )
 def test_an_option_is_checked_when_the_object_is_made(make, text):

@@ -87,7 +87,7 @@ def test_best_score_is_near_the_true_pose(tilts, most):
     true_pose, scan_map = rooms.scene(1)[2], rooms.scan_map(1)
     rotations = uniform_yaws(48) if tilts == "known" else uniform_rotations(2000)
     samples, validity = search.turn_panorama(_problem().photo.images.search(), rotations)
-    sparse, rotation, values = search.best_poses_wide(scan_map, samples, validity, 200, Workers(2))
+    sparse, rotation, values = search.best_poses_wide(scan_map, samples, validity, 200, 512, Workers(2))
     assert (np.diff(values) <= 0).all()
     starts = search.search_poses(_problem(), tilts, EFFORT, rooms.WORKERS)
     centers = scan_map.centers[scan_map.sparse[sparse]]
@@ -100,14 +100,12 @@ def test_best_score_is_near_the_true_pose(tilts, most):
         assert any(near[:most])
 
 
-def test_a_part_of_the_candidates_at_a_time_gives_the_same_poses(monkeypatch):
+def test_a_part_of_the_candidates_at_a_time_gives_the_same_poses():
     scan_map, rotations = rooms.scan_map(1), uniform_rotations(200)
     samples, validity = search.turn_panorama(_problem().photo.images.search(), rotations)
-    whole = search.best_poses_wide(scan_map, samples, validity, 500, Workers(1))
-    monkeypatch.setattr(search, "BLOCK", 7)
-    monkeypatch.setattr(search, "SCORES_AT_ONCE", 30 * len(rotations))
-    assert len(scan_map.sparse) > 3 * search.views_at_once(len(rotations))
-    in_parts = search.best_poses_wide(scan_map, samples, validity, 500, Workers(2))
+    num = len(scan_map.sparse)
+    whole = search.best_poses_wide(scan_map, samples, validity, 500, num, Workers(1))
+    in_parts = search.best_poses_wide(scan_map, samples, validity, 500, num // 4, Workers(2))
     for expected, found in zip(whole, in_parts, strict=True):
         np.testing.assert_array_equal(found, expected)
 
@@ -214,7 +212,7 @@ def test_starts_of_a_narrow_photo_are_the_distinct_best_of_wide_views():
     assert 14.0 <= nearest < 20.0
     rotations = search.list_rotations(narrow, "level", EFFORT)
     samples, validity = search.turn_panorama(narrow.photo.images.search(), rotations)
-    found = search.best_poses_wide(narrow.scan_map, samples, validity, 20, Workers(1), True)
+    found = search.best_poses_wide(narrow.scan_map, samples, validity, 20, 512, Workers(1), True)
     best = found[0][0], found[1][0]
     np.testing.assert_array_equal(starts.R_cam_from_map[0], rotations[best[1]])
     assert starts.candidate[0] == narrow.scan_map.sparse[best[0]]
@@ -233,16 +231,23 @@ def test_heading_is_the_worlds_where_the_map_was_levelled(tilts):
     assert np.abs(off).max() < 20.0 + 1e-6
 
 
-@pytest.mark.parametrize(("fewest", "most", "expected"), [(150, 4000, 150), (150, 20, 20), (1, 4000, None)])
-def test_number_of_starts(monkeypatch, fewest, most, expected):
+@pytest.mark.parametrize(
+    ("num_candidates", "most", "expected"),
+    [(9000, 4000, 4000), (5000, 4000, 2500), (900, 4000, 1000), (900, 20, 20)],
+)
+def test_number_of_starts(num_candidates, most, expected):
     """One for every two candidates that are searched, but not fewer and not more than asked for."""
+    assert search.count_starts(num_candidates, most, False) == expected
+    assert search.count_starts(num_candidates, most, True) == most
+
+
+@pytest.mark.parametrize("most", [20, 150])
+def test_starts_are_apart(most):
     problem = _problem()
-    monkeypatch.setattr(search, "MIN_STARTS", fewest)
     effort = EFFORT._replace(max_starts=most)
     for tilts in ("known", "any"):
         starts = search.search_poses(problem, tilts, effort, rooms.WORKERS)
-        num_searched = len(problem.scan_map.sparse)
-        assert len(starts.candidate) == (expected or num_searched // 2)
+        assert len(starts.candidate) == most
         np.testing.assert_array_equal(starts.center_map, problem.scan_map.centers[starts.candidate])
         pairs = itertools.combinations(starts.poses(), 2)
         apart = np.array([rooms.errors(*pair) for pair in pairs])

@@ -40,20 +40,30 @@ def test_of_poses_that_matches_gave_the_better_end_is_taken():
 
 
 @pytest.fixture
-def done(monkeypatch):
-    """What is done to candidates on their last way, by their places; the score becomes what they explain."""
+def last_way(monkeypatch):
+    """What is done to candidates on their last way, by their places, and where they come to rest.
+
+    Elsewhere that only makes the score what they explain.
+    """
     made = []
+    ends = {}
 
     def note(name):
         def refine(problem, candidate, workers):
             made.append((name, place(candidate.pose)))
-            return replace(candidate, score=candidate.seen.score)
+            explained = replace(candidate, score=candidate.seen.score)
+            return ends.get(made[-1], explained)
 
         return refine
 
     for name in ("climb_to_full", "climb_unoccluded", "settle"):
         monkeypatch.setattr(last_descent, name, note(name))
-    return made
+    return made, ends
+
+
+@pytest.fixture
+def done(last_way):
+    return last_way[0]
 
 
 def test_alternatives_that_come_near_are_refined_and_the_greatest_odds_win(done):
@@ -147,24 +157,19 @@ def test_of_poses_that_beat_each_other_in_turn_the_one_beaten_least_is_best():
         assert selected.rival_ratio == pytest.approx(1.0 / 0.9)
 
 
-def test_the_best_pose_has_come_to_rest_and_is_still_the_best(monkeypatch):
+def test_the_best_pose_has_come_to_rest_and_is_still_the_best(last_way):
     """At rest, the first explains less than the second; of the two at rest, the second is better."""
-    rested = []
-    ends = {0.0: make_candidate(0.01, 0.5, 20, 0.3), 3.0: make_candidate(3.01, 0.5, 20, 0.46)}
-
-    def settle(problem, h, workers):
-        rested.append(place(h.pose))
-        return ends.get(rested[-1], h)
-
-    monkeypatch.setattr(last_descent, "settle", settle)
+    done, ends = last_way
+    ends["settle", 0.0] = make_candidate(0.01, 0.5, 20, 0.3)
+    ends["settle", 3.0] = make_candidate(3.01, 0.5, 20, 0.46)
     given = make_selection(make_candidate(0.0, 0.5, 20), make_candidate(3.0, 0.5, 20, 0.45))
     found = last_descent.settle_best(PROBLEM, given, ALONE)
-    assert rested == [0.0, 3.0]
+    assert done == [("settle", 0.0), ("settle", 3.0)]
     assert places(found.candidates) == [3.01, 0.01]
-    rested.clear()
-    ends[0.0] = make_candidate(0.01, 0.5, 20, 0.49)
+    done.clear()
+    ends["settle", 0.0] = make_candidate(0.01, 0.5, 20, 0.49)
     found = last_descent.settle_best(PROBLEM, given, ALONE)
-    assert (rested, place(found.best.pose)) == ([0.0], 0.01)
+    assert (done, place(found.best.pose)) == ([("settle", 0.0)], 0.01)
 
 
 def test_margin_is_the_lesser_of_two_leads():

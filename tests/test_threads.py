@@ -92,13 +92,12 @@ def test_a_forked_process_has_threads_of_its_own():
     assert child.exitcode == 6
 
 
-def test_a_burst_of_callers_leaves_no_more_threads_than_the_cores_have_use_for(monkeypatch):
-    monkeypatch.setattr(threads, "num_cores", lambda: 2)
-    monkeypatch.setattr(threads, "_idle", {})
+def test_a_burst_of_callers_leaves_no_more_threads_than_the_cores_have_use_for():
+    most = max(threads.num_cores(), 2)
     with ExitStack() as stack:
-        pools = [stack.enter_context(threads.get_pool(2)) for _ in range(5)]
-        assert [pool.submit(abs, -1).result() for pool in pools] == [1] * 5
-    assert len(threads._idle[2]) == 2
+        pools = [stack.enter_context(threads.get_pool(2)) for _ in range(most + 3)]
+        assert [pool.submit(abs, -1).result() for pool in pools] == [1] * len(pools)
+    assert len(threads._idle[2]) == most
     with threads.get_pool(2) as pool:
         assert pool.submit(abs, -1).result() == 1
 
@@ -218,9 +217,14 @@ def test_an_error_gives_them_back(three_threads):
     assert _threads() == three_threads
 
 
-def test_a_photo_is_localized_with_one(three_threads, monkeypatch):
-    seen = []
-    monkeypatch.setattr(method, "judge", lambda *_: seen.append(_threads()))
+def test_a_photo_is_localized_with_one(three_threads):
+    seen = set()
+
+    def show(values, total, label):
+        seen.add((label, *_threads()))
+        yield from values
+
     settings = CoarseToFineSettings(gravity="known")
-    method.localize(rooms.scan_map(1), rooms.scene(1)[1], settings, Workers(2), Stopwatch())
-    assert seen == [{1}]
+    method.localize(rooms.scan_map(1), rooms.scene(1)[1], settings, Workers(2, show), Stopwatch())
+    assert {("search", 1), ("evaluate", 1)} <= seen
+    assert all(counts == [1] for _, *counts in seen)

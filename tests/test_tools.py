@@ -101,11 +101,10 @@ def test_the_times_of_two_methods_are_compared_by_their_medians():
     assert page.time_ratio(rows) == pytest.approx(7.5)
 
 
-def test_sizes_are_those_asked_for(scene, monkeypatch):
-    monkeypatch.setattr(speed, "NUM_QUERIES", 1)
-    points, _, queries = speed.scene_case(read_scene(scene), 50_000)  # more than it has
+def test_sizes_are_those_asked_for(scene):
+    points, _, queries = speed.scene_case(read_scene(scene), 50_000, 1)  # more than it has
     assert (len(points), len(queries)) == (50_000, 1)
-    points, _, queries = speed.rooms_case(1)
+    points, _, queries = speed.rooms_case(1, 1)
     assert (len(points), len(queries)) == (50_000, 1)
 
 

@@ -291,11 +291,12 @@ def walk():
     beliefs[LOST] = NOTHING
     probabilities = [belief.probabilities for belief in beliefs]
 
-    def find(query, frame, near):
+    def find(problem, frame, near):
         expected = expect(frame, [(frames[k], pose) for k, pose in near], Motion())
-        return results.find_near(query, expected)
+        return results.find_near(problem, expected, None)
 
-    tracker = SimpleNamespace(frames=frames, motion=Motion(), find=find, query_of=lambda k: k)
+    about = {"find": find, "problem_of": lambda k: k, "means": None}
+    tracker = SimpleNamespace(frames=frames, motion=Motion(), **about)
     return tracker, walk_path.Path(probabilities, [None] * len(frames)), beliefs
 
 
@@ -303,7 +304,7 @@ def _find(walk, monkeypatch, x, how="near", is_alone=True):
     """Look for the lost frame, which is found at a place; return it, and where it was expected."""
     asked = []
 
-    def find(query, expected):
+    def find(problem, expected, means):
         asked.append(expected)
         return Followed(State(_at(x), 5.0, 0.5), how, is_alone)
 

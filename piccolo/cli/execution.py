@@ -95,8 +95,12 @@ def count_fitting(arguments: Arguments, num_jobs: int) -> int:
     """Return how many of the processes memory is left for; called where one has what each will need."""
     if arguments.jobs is not None:
         return num_jobs
-    taken = memory_taken()
-    return max(1, min(num_jobs, int((memory_left() + taken) // (taken + QUERY_MEMORY))))
+    return min(num_jobs, count_in_memory(memory_taken(), memory_left()))
+
+
+def count_in_memory(taken: float, left: float) -> int:
+    """Return for how many processes memory is left, of which one has taken its part [byte]."""
+    return max(1, int((left + taken) // (taken + QUERY_MEMORY)))
 
 
 def share_of_a_job(arguments: Arguments, localizer: Localizer, num_jobs: int) -> Localizer:

@@ -7,7 +7,7 @@ for 3D Reconstruction with Consumer Depth Cameras" (SIGGRAPH 2014), who move one
 their exposures alike. A photo sees the nearest surfaces, best where it looks at them squarely from near.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -139,22 +139,28 @@ def find_sightings(octree: Octree, points: Array32, poses: Sequence[Pose], worke
         weigh_points(points, look(octree, pose), pose.R_cam_from_world, pose.center_world, found)
         return found
 
-    best = np.zeros((len(points), MOST_SEEN), np.float32)
-    photos = np.full(best.shape, len(poses))
-    for begin in range(0, len(poses), AT_ONCE):
-        for k, found in enumerate(workers.map(weigh, poses[begin : begin + AT_ONCE], "see"), begin):
-            least = np.arange(len(points)), best.argmin(axis=1)
-            is_better = found > best[least]
-            photos[least] = np.where(is_better, k, photos[least])
-            best[least] = np.where(is_better, found, best[least])
+    parts = (poses[begin : begin + AT_ONCE] for begin in range(0, len(poses), AT_ONCE))
+    weights = (found for part in parts for found in workers.map(weigh, part, "see"))
+    return keep_best(weights, len(points), len(poses))
+
+
+def keep_best(weights: Iterable[Array32], num_points: int, num_photos: int) -> Sightings:
+    """Keep the photos that see each point best, by weights (N,) of each photo; 0 of points not seen."""
+    best = np.zeros((num_points, MOST_SEEN), np.float32)
+    photos = np.full(best.shape, num_photos)
+    for k, found in enumerate(weights):
+        least = np.arange(num_points), best.argmin(axis=1)
+        is_better = found > best[least]
+        photos[least] = np.where(is_better, k, photos[least])
+        best[least] = np.where(is_better, found, best[least])
     photos.sort(axis=1)
-    is_seen = photos < len(poses)
+    is_seen = photos < num_photos
     is_seen &= is_seen.sum(axis=1, keepdims=True) > 1
     point = np.nonzero(is_seen)[0]
     photo = photos[is_seen]
-    counts = np.bincount(photo, minlength=len(poses))
+    counts = np.bincount(photo, minlength=num_photos)
     own = np.split(np.argsort(photo, kind="stable"), np.cumsum(counts)[:-1])
-    return Sightings(np.searchsorted(point, np.arange(len(points) + 1)), point, photo, own)
+    return Sightings(np.searchsorted(point, np.arange(num_points + 1)), point, photo, own)
 
 
 def read_all(

@@ -9,7 +9,7 @@ import re
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
@@ -69,10 +69,10 @@ def list_kernels() -> Iterator[tuple[Any, tuple[Any, ...]]]:
             yield jit.KERNELS[name], parse(arguments)
 
 
-def compile_listed() -> None:
-    """Compile the kernels of the list that nobody has compiled, or is compiling."""
+def compile_missing(kernels: Iterable[tuple[Any, Any]]) -> None:
+    """Compile kernels, given with the types of their arguments, that nobody has compiled or is compiling."""
     codegen = cpu_target.target_context.codegen()
-    for dispatcher, arguments in list_kernels():
+    for dispatcher, arguments in kernels:
         path = dispatcher._cache.file(arguments, codegen)
         if path is None:
             return
@@ -114,7 +114,7 @@ def main() -> int:
         threading.Thread(target=_end_with_parent, daemon=True).start()
     else:
         helpers = start_helpers(num_cores() - 1)
-    compile_listed()
+    compile_missing(list_kernels())
     return max([0, *(abs(helper.wait()) for helper in helpers)])
 
 

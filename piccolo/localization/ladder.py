@@ -1,6 +1,7 @@
 """Poses refined on the ladder of stages: from coarse images and views to single points."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -58,18 +59,27 @@ def descend_on(problem: Problem, cells: Cells, pose: Pose, stage: Stage) -> Hypo
 
 def climb(problem: Problem, start: Pose, workers: Workers) -> Hypothesis:
     """Refine a pose on fine cells, and poses around it, for as long as its score rises."""
-    cells = problem.view_at(start, FINE.view)
+    first = problem.view_at(start, FINE.view)
     blocks = VIEWS[FINE.view].arrays.blocks
-    best = score_on_cells(cells, blocks, problem.photo.image(FINE.image), start)
-    for _ in range(MAX_PERTURBATIONS):
+
+    def perturb(best: Hypothesis) -> Hypothesis:
+        cells = first if best.pose is start else problem.view_at(best.pose, FINE.view)
         around = descend_around(problem, cells, best.pose, AROUND_FINE, workers)
-        refined = refine(problem, around.pose, workers, FINE)
+        return refine(problem, around.pose, workers, FINE)
+
+    begin = score_on_cells(first, blocks, problem.photo.image(FINE.image), start)
+    return replace(climb_by(perturb, begin), is_climbed=True)
+
+
+def climb_by(perturb: Callable[[Hypothesis], Hypothesis], best: Hypothesis) -> Hypothesis:
+    """Perturb the best pose, and descend from there, for as long as its score rises."""
+    for _ in range(MAX_PERTURBATIONS):
+        refined = perturb(best)
         gain = refined.score - best.score
         best = refined if gain > 0.0 else best
         if gain < MIN_GAIN * refined.score:
             break
-        cells = problem.view_at(best.pose, FINE.view)
-    return replace(best, is_climbed=True)
+    return best
 
 
 def climb_from_afar(problem: Problem, start: Pose, workers: Workers) -> tuple[Pose, Pose]:

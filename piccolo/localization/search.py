@@ -112,20 +112,20 @@ def best_poses_wide(
     samples: Samples,
     validity: Samples,
     pool: int,
+    num_views: int,
     workers: Workers,
     is_centered: bool = False,
 ) -> tuple[Int64s, Int64s, Samples]:
     """Return the best `pool` poses by the masked correlation of wide views with the averaged panorama.
 
-    The result is as of `best_poses`. Candidates are scored in parts: the scores of a campus in all rotations
-    would take a gigabyte.
+    The result is as of `best_poses`. `num_views` candidates are scored at a time: the scores of a campus in
+    all rotations would take a gigabyte.
     """
     area = wider_cells(WIDE_RINGS)[1]
     wide_samples, wide_validity = widen_samples(samples, validity, workers)
     if is_centered:
         wide_samples *= wide_validity[:, None]
     panorama = weigh_by_area(wide_samples, wide_validity, area, 255)
-    num_views = views_at_once(len(samples))
     least = LOWEST
     sparse = np.empty(0, np.int64)
     rotation = np.empty(0, np.int64)
@@ -188,10 +188,9 @@ def search_poses(problem: Problem, tilts: Tilts, effort: Effort, workers: Worker
     check_memory(num_bytes, task, "set fewer num_yaws or num_rotations")
     samples, validity = turn_panorama(problem.photo.images.search(), rotations)
     is_partial = problem.profile.is_partial
-    enough = max(len(m.sparse) // CANDIDATES_PER_START, MIN_STARTS)
-    num_starts = effort.max_starts if is_partial else min(enough, effort.max_starts)
+    num_starts = count_starts(len(m.sparse), effort.max_starts, is_partial)
     pool = num_starts * POSES_PER_START
-    sparse, turn, _ = best_poses_wide(m, samples, validity, pool, workers, is_partial)
+    sparse, turn, _ = best_poses_wide(m, samples, validity, pool, num_views, workers, is_partial)
     candidate = m.sparse[sparse]
     R = rotations[turn]
     centers = m.centers[candidate]
@@ -208,6 +207,11 @@ def search_poses(problem: Problem, tilts: Tilts, effort: Effort, workers: Worker
     correlate_pairs(views.features, views.is_seen, areas, panorama, row, row_of_turn, scores)
     order = np.lexsort((turn[kept], candidate, -scores))
     return Starts(R[kept][order], centers[kept][order], candidate[order])
+
+
+def count_starts(num_candidates: int, most: int, is_partial: bool) -> int:
+    """Return from how many poses descents begin: for a whole photo fewer, where there are few candidates."""
+    return most if is_partial else min(max(num_candidates // CANDIDATES_PER_START, MIN_STARTS), most)
 
 
 def list_rotations(problem: Problem, tilts: Tilts, effort: Effort) -> Array:

@@ -179,6 +179,7 @@ class CandidateViews:
     octree: Octree
     centers: Array  # (candidates, 3) [m]
     config: ViewConfig = SEARCH_VIEW
+    most_kept: int = MOST_KEPT
     made: Views = field(init=False)  # with room for more
     num_made: int = field(init=False, default=0)
 
@@ -196,7 +197,7 @@ class CandidateViews:
         """Return the rows (n,) of candidates (n,) in the views, made if missing, and the views."""
         with self._lock:
             missing = np.unique(candidates[self._row[candidates] < 0])
-            if len(missing) and self.num_made + len(missing) > MOST_KEPT:
+            if len(missing) and self.num_made + len(missing) > self.most_kept:
                 missing = np.unique(candidates)
                 self._forget()  # who was given the old ones has them
             if len(missing):
@@ -209,7 +210,7 @@ class CandidateViews:
         begin = self.num_made
         self.num_made += len(views.centers)
         if self.num_made > len(self.made.centers):
-            room = max(self.num_made, min(2 * begin, MOST_KEPT), LEAST_ROOM)
+            room = max(self.num_made, min(max(2 * begin, LEAST_ROOM), self.most_kept))
             larger = empty_views(room, self.made.is_seen.shape[1])
             put_rows(larger, 0, [values[:begin] for values in self.made])
             self.made = larger

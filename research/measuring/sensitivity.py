@@ -92,7 +92,7 @@ def move(value: float, name: str, factor: float) -> float:
 
 
 @contextmanager
-def moved(module: str, name: str, factor: float) -> Iterator[None]:
+def move_constant(module: str, name: str, factor: float) -> Iterator[None]:
     """Move a constant in its module and in all that have imported it."""
     value = getattr(importlib.import_module(f"piccolo.{module}"), name)
     users = [
@@ -173,7 +173,7 @@ def run(arguments: Arguments) -> int:
     rows = [row_of("as they are", before, before)]
     for module, names in CONSTANTS.items():
         for name, factor in product(names, (1.0 - STEP, 1.0 + STEP)):
-            with moved(module, name, factor):
+            with move_constant(module, name, factor):
                 rows.append(row_of(f"{module}.{name} x {factor:.1f}", measure(places, workers), before))
             arguments.note(" ".join(rows[-1].values()))
     print(table_of(rows).markdown())

@@ -55,7 +55,7 @@ def clean_queries(scene: Scene, count: int) -> list[Query]:
     return (clean or list(scene.queries))[:count]
 
 
-def scene_case(scene: Scene, num_points: int) -> Case:
+def scene_case(scene: Scene, num_points: int, num_queries: int = NUM_QUERIES) -> Case:
     """Resample a scene to `num_points` points: leave some out, or repeat them with 5 mm noise."""
     cloud = open_cloud([scene.cloud]).read()
     rng = np.random.default_rng(0)
@@ -65,16 +65,16 @@ def scene_case(scene: Scene, num_points: int) -> Case:
     points = cloud.points[index]
     if num_points > len(cloud.points):
         points = points + rng.normal(0.0, 0.005, points.shape).astype(np.float32)
-    queries = [(read_panorama(q.image).rgb, q.pose) for q in clean_queries(scene, NUM_QUERIES)]
+    queries = [(read_panorama(q.image).rgb, q.pose) for q in clean_queries(scene, num_queries)]
     return Case(points + cloud.origin_world, cloud.colors[index], queries)
 
 
-def rooms_case(num_rooms: int) -> Case:
+def rooms_case(num_rooms: int, num_queries: int = NUM_QUERIES) -> Case:
     """Make seeded rooms side by side."""
     workers = Workers(num_cores())
     world = make_world(11, np.array([5.0, 4.0, 2.6]), num_rooms)
     points, colors, _ = scan_world(world, 50_000 * num_rooms, workers)
-    taken = [make_query(world, k, "clean", 1024, workers) for k in range(NUM_QUERIES)]
+    taken = [make_query(world, k, "clean", 1024, workers) for k in range(num_queries)]
     return Case(points, colors, [(query.rgb, query.pose) for query in taken])
 
 
