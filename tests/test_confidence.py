@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import rooms
 from made_up import at
-from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.problem.settings import CoarseToFineSettings
 from rooms import as_panorama
 
 from piccolo.errors import InputError

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import rooms
-from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.problem.settings import CoarseToFineSettings
 from pictures import encoded, write
 from refusals import assert_input_error
 from test_priors import write_photo
