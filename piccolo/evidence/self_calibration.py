@@ -21,7 +21,6 @@ from ..problem.stages import Limits
 from ..views.view import Cells
 from .covariance import jackknife_gradients, sort_by_block, take
 
-LEAST_INFORMATION = 1e-9  # that makes matrices invertible
 MASKED_LOSS = 0.25  # of a point on masked pixels, times the square of the loss's scale
 # of the matrix of Gauss and Newton, which ignores that the loss flattens: with it, 95 % of true corrections
 # of 48 crops of three scenes lie within two deviations
@@ -116,7 +115,7 @@ def descend_freely(
 
     start = at(pose, values)
     precision = freedom.deviations**-2.0 / relate_to_chance(start.sums)
-    known = np.diag(np.concatenate([np.zeros(NUM_OF_POSE), precision]) + LEAST_INFORMATION)
+    known = np.diag(np.concatenate([np.zeros(NUM_OF_POSE), precision]))
     end, found = minimize(equations, move, start, limits.num_iterations, limits.tolerance)
     return end._replace(loss=found.loss)
 
