@@ -30,17 +30,19 @@ from ..panorama import Panorama
 from ..panorama.model import FocalPrior
 from ..views.view import Cells
 from .comparison import compare, mask_occluders, score_pose
-from .covariance import UNCALIBRATED
+from .covariance import UNCALIBRATED, compute_median_range
 from .ladder import Limits
 from .last_descent import refine_best
-from .lens_matches import MOST, add_matches, fit_matches
+from .lens_matches import MOST, MatchFit, add_matches, fit_matches
 from .query import Features, Query, prepare_query
+from .scan_errors import displacement_variance
 from .selection import Selection
 from .self_calibration import (
     Estimate,
     Freedom,
     FreeEnd,
     descend_freely,
+    displace_blocks,
     estimate_corrections,
     invert,
 )
@@ -64,12 +66,7 @@ ALL_WIDTHS = (0.1, 0.05, 0.02, 0.02, 0.1)
 DISAGREE = 2.0  # deviations between picture and what was given, by which chance parts them in one of twenty
 CLEARLY = 2.5  # deviations by which matches must tell another one
 MIN_SCORE_LEFT = 0.95  # fraction of the score that it must keep
-# of the covariance where all corrections are free, so that right calibrations of 91 crops differ from what is
-# found as chance has it
-INFLATION_OF_ALL = 2.0
-# [px] of the sphere at the picture's edge, which all blocks may have in common; with 0.4 of the focal length
-# a right calibration was called wrong in the real corridor of tests/data
-EDGE_ERRORS = (0.6, 0.2, 0.2, 0.2, 0.4)
+EDGE_ERROR = 0.2  # chosen: [px] of the sphere at the picture's edge, which all blocks may have in common
 AT_REST = 0.5  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
 MAX_CALIBRATIONS = 4  # fits of a focal length
@@ -138,13 +135,13 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     claim = make_claim(prior, camera)
     near, far = descend_lens(query, pose, claim, is_first)
     by_matches = fit_matches(query, pose, FOCAL_WIDTHS)
-    estimate = add_matches(estimate_lens(query, pose, near), by_matches)
+    estimate = estimate_lens(query, pose, near, by_matches)
     free = estimate_lens(query, pose, far)
     values, information, motion = estimate
     off, variance = marginal(values, information, claim, FOCAL)
     off -= claim.expected[FOCAL]
     opinion = Opinion(off, variance) if variance < MOST_VARIANCE else None
-    opinions = estimate, free._replace(information=free.information / INFLATION_OF_ALL)
+    opinions = estimate, free
     tests = [claim.contradict(*told[:2])[0] for told in opinions]
     worst = np.abs(tests).max(axis=0)
     change, total = average(prior, claim, estimate, opinion, float(worst.max()))
@@ -169,19 +166,16 @@ def average(
 ) -> tuple[Array, Array]:
     """Return the mean (5,) of picture and claim, and its covariance (5, 5).
 
-    The variance of a focal length that was given grows by what both disagree too much.
+    The variance of a focal length that was given grows by what both disagree, if that is not by chance.
     """
     precision = claim.precision
-    wide = precision.copy()
-    if opinion is not None:
+    if opinion is not None and conflict > DISAGREE:  # then the picture says where to look next
         # as by DerSimonian and Laird (1986)
         excess = max(opinion.off**2 - opinion.variance - prior.deviation**2, 0.0)
-        wide[FOCAL] = 1.0 / (prior.deviation**2 + (0.0 if prior.is_measured else excess))
-    if conflict > DISAGREE:
-        precision = wide  # the picture says where to look next
+        precision[FOCAL] = 1.0 / (prior.deviation**2 + (0.0 if prior.is_measured else excess))
     goal = estimate.information @ estimate.values + precision * claim.expected
-    change = np.linalg.inv(estimate.information + np.diag(precision)) @ goal
-    return change, np.asarray(np.linalg.inv(estimate.information + np.diag(wide)))
+    total = np.linalg.inv(estimate.information + np.diag(precision))
+    return total @ goal, np.asarray(total)
 
 
 def find_errors_of_picture(estimate: Estimate, claim: Claim) -> Array:
@@ -267,20 +261,30 @@ def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
     return points._replace(weights=points.weights * is_kept.astype(np.float32))
 
 
-def estimate_lens(query: Query, pose: Pose, end: FreeEnd) -> Estimate:
+def estimate_lens(query: Query, pose: Pose, end: FreeEnd, by_matches: MatchFit | None = None) -> Estimate:
     """Estimate the corrections of a lens at the end of a descent from a pose, which tells nothing if it left.
 
-    Errors of the picture's edge that all blocks may have in common are added.
+    Added are errors of the picture's edge that all blocks may have in common and, as those of the matches
+    too, those of the scan.
     """
     estimate = estimate_corrections(end)
     if end.pose.distance(pose) > FAR:
-        return estimate._replace(information=np.zeros_like(estimate.information))
+        estimate = estimate._replace(information=np.zeros_like(estimate.information))
     camera = query.given.cameras[0].camera
     per_px = math.tau * camera.focal[0] / (0.5 * camera.width * query.photo.panorama.rgb.shape[1])
-    covariance = invert(estimate.information)
+    estimate = add_errors(estimate, (EDGE_ERROR * per_px) ** 2 * np.eye(len(LENS)))
+    if by_matches is not None:
+        estimate = add_matches(estimate, by_matches)
+    median_range = compute_median_range(query.view_at(pose, "points"))
+    variance = displacement_variance(query.scan_map, pose, median_range)
+    return add_errors(estimate, displace_blocks(end, variance))
+
+
+def add_errors(estimate: Estimate, errors: Array) -> Estimate:
+    """Return an estimate with further errors (5, 5); what it does not tell stays so."""
     is_known = estimate.information.any(axis=1)
-    errors = np.diag(is_known * (np.array(EDGE_ERRORS) * per_px) ** 2)
-    return estimate._replace(information=invert(covariance + errors))
+    covariance = invert(estimate.information) + errors * np.outer(is_known, is_known)
+    return estimate._replace(information=invert(covariance))
 
 
 def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFit]:

@@ -117,12 +117,13 @@ def judge(query: Query, found: Selection, fit: Fit | None = None, may_promote: b
 def doubt_alone(fit: Fit | None, gaussian: PoseGaussian | None) -> Fit | None:
     """Return the fit of a photo by itself, doubted more where the photo does not confirm what was given.
 
-    If what was given says nothing, the pose is only as exact as by the photo's own focal length.
+    If what was given says nothing, the pose is only as exact as by the photo's own focal length. Both doubts
+    are about the same wrong claims: the greater one counts.
     """
     if not isinstance(fit, FocalFit) or fit.of_picture is None or gaussian is None:
         return fit
     missed = 1.0 - probability_within(gaussian.widen(fit.of_picture))
-    return fit._replace(doubt=1.0 - (1.0 - fit.doubt) * (1.0 - UNCONFIRMED * missed))
+    return fit._replace(doubt=max(fit.doubt, UNCONFIRMED * missed))
 
 
 def judge_together(
