@@ -152,6 +152,25 @@ def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(monkeypatch, 
     assert (open_fit.change[0], open_fit.deviation, open_fit.conflict) == (0.0, pytest.approx(0.01), 0.0)
 
 
+def test_what_other_photos_tell_is_not_doubted_by_one_of_them(monkeypatch):
+    """Its confidence would follow a millimetre of theirs: from 3.3 to 4 deviations a doubt is 0.4 to 0.9."""
+    rgb, pose = _photo(pinhole(320, 240, TRUE))
+    given = _panorama(rgb, focal_px=TRUE)
+    first = np.eye(5)[0]
+    found = Estimate(0.04 * first, np.diag(1e4 * first), np.ones((6, 5)))
+    monkeypatch.setattr(focal, "descend_lens", lambda *args: (None, None))
+    monkeypatch.setattr(focal, "estimate_lens", lambda *args: found)
+    monkeypatch.setattr(focal, "fit_matches", lambda query, pose, _: MatchFit(np.zeros(5), 0.0, pose))
+    by_others = given.expect_focal(TRUE, 0.004)
+    alone, beside = (
+        focal.fit_focal(rooms.ask(panorama, rooms.scan_map(SEED)), scan().from_world(pose))
+        for panorama in (given, by_others)
+    )
+    assert alone.doubt > 0.1
+    assert beside.doubt == 0.0
+    assert beside.conflict == pytest.approx(0.04 / math.hypot(0.01, 0.004), rel=0.02)
+
+
 def test_matches_lead_to_a_focal_length_that_is_far_off():
     rgb, pose = _photo(pinhole(320, 240, TRUE))
     query = rooms.ask(_panorama(rgb, focal_px=0.8 * TRUE), rooms.scan_map(SEED))

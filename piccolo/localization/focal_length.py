@@ -83,7 +83,7 @@ class FocalFit(NamedTuple):
     motion: Array  # (6, p) of a pose with it: rotation about the camera's axes [rad], centre in the map [m]
     opinion: Opinion | None  # what the picture alone says; None if it says nothing
     conflict: float  # deviations between that and what was given; 0 if it says nothing
-    doubt: float = 0.0  # as of FocalLength
+    doubt: float = 0.0  # as of FocalLength; none of what other photos of the camera tell
     of_rest: Array | None = None  # (6, 6) what the other corrections add to the covariance of a pose
     # (6, 6) what all corrections would add if nothing that was given holds; None of a guess
     of_picture: Array | None = None
@@ -154,7 +154,7 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         motion[:, fitted],
         opinion,
         float(worst.max()),
-        max(claim.doubt(*told[:2]) for told in opinions),
+        0.0 if prior.is_measured else max(claim.doubt(*told[:2]) for told in opinions),
         np.asarray(motion[:, rest] @ spread @ motion[:, rest].T),
         None if prior.is_measured or prior.deviation > WIDE else find_errors_of_picture(free, claim),
         LENS[int(worst.argmax())],

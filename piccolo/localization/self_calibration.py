@@ -162,7 +162,7 @@ def displace_blocks(end: FreeEnd, variance: Array) -> Array:
     """
     R = end.pose.R_cam_from_world
     inverse = np.linalg.pinv(end.sums.matrices.sum(axis=0))
-    by_move = inverse[NUM_OF_POSE:] @ end.sums.matrices[:, :, 3:NUM_OF_POSE]  # (B, p, 3), in the camera's axes
+    by_move = inverse[NUM_OF_POSE:] @ end.sums.matrices[:, :, 3:NUM_OF_POSE]  # (B, p, 3) [1 / m]
     return np.asarray(np.einsum("bik,kl,bjl->ij", by_move, R @ variance @ R.T, by_move))
 
 
