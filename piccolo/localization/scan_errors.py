@@ -9,9 +9,6 @@ from ..scan_map.scan_map import ScanMap
 
 SHAPE_TURN = 0.003  # [rad] by which edges of a photo are not where the scan's are, in all blocks alike
 SHAPE_MOVE = 0.01  # [m]
-# [m] of a surface against others: registered scans have less, those of phones up to 2 cm. With it, focal
-# lengths by eight photos of a real corridor differ from their calibrations by 1.2 deviations
-DISPLACEMENT = 0.015
 
 
 def scan_covariance(scan_map: ScanMap, median_range: float) -> Array:
@@ -43,4 +40,4 @@ def layer_covariance(scan_map: ScanMap, pose: Pose, median_range: float) -> Arra
 def displacement_variance(scan_map: ScanMap, pose: Pose, median_range: float) -> Array:
     """Return the covariance (3, 3) [m^2], in the map's axes, by which surfaces lie beside where they are."""
     common = scan_covariance(scan_map, median_range) + layer_covariance(scan_map, pose, median_range)
-    return common[3:, 3:] + DISPLACEMENT**2 * np.eye(3)
+    return common[3:, 3:] + scan_map.displacement**2 * np.eye(3)
