@@ -176,8 +176,8 @@ def fit_planes(octree: Octree, levels_up: int) -> Iterator[Planes]:
         some = full[begin : begin + SOME_CELLS]
         counts = (edges[some + 1] - edges[some]).astype(np.int64)
         first = np.cumsum(counts) - counts
-        leaves = octree.nodes[np.arange(counts.sum()) + np.repeat(edges[some] - first, counts), :3]
-        leaves = leaves.astype(np.float64)
+        which = np.arange(counts.sum()) + np.repeat(edges[some] - first, counts)
+        leaves: Array = octree.nodes[which, :3].astype(np.float64)
         offsets = leaves - np.repeat(np.add.reduceat(leaves, first) / counts[:, None], counts, axis=0)
         products = (offsets[:, :, None] * offsets[:, None, :]).reshape(-1, 9)
         moments = (np.add.reduceat(products, first) / counts[:, None]).reshape(-1, 3, 3)
@@ -216,7 +216,7 @@ def displacement(octree: Octree) -> float:
             return UNKNOWN_DISPLACEMENT
         variances.append(float(np.median(np.concatenate(across))))
     size = octree.leaf_size * 2 ** CELLS[-1]
-    return SURFACE / size * math.sqrt(max(variances[1] - variances[0], 0.0))
+    return float(SURFACE / size * math.sqrt(max(variances[1] - variances[0], 0.0)))
 
 
 def fit_tensor(normals: Array, variances: Array) -> Array:
