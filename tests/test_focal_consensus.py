@@ -115,7 +115,7 @@ def test_a_photo_is_looked_at_again_with_the_focal_length_of_the_others():
 
 
 def test_a_batch_finds_the_focal_length_of_its_camera(tmp_path):
-    """The whole thing by the command line, with a field of view by which the focal length is 3 % too long."""
+    """The whole thing by the command line, with a focal length that is 3 % too long."""
     room, pose = place(1)
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -125,8 +125,7 @@ def test_a_batch_finds_the_focal_length_of_its_camera(tmp_path):
         poses.append(Pose(turned, pose.center_world + np.array([0.02 * k, 0.03, 0.0])))
         picture = render_picture(Mount(pinhole(320, 240, TRUE)), room, poses[k], Workers(2))
         write(photos / f"{k}.png", encoded(picture, ".png"))
-    words = ["--cloud", str(rooms.map_path(SEED, DENSE)), "--pano", str(photos), "--projection", "pinhole"]
-    words += ["--fov", str(math.degrees(2.0 * math.atan(160.0 / (1.03 * TRUE))))]
+    words = ["--cloud", str(rooms.map_path(SEED, DENSE)), "--pano", str(photos), "--focal", str(1.03 * TRUE)]
     out = tmp_path / "poses.jsonl"
     main([*words, "--gravity", "known", "--quiet", "--threads", "2", "--out", str(out)])
     results = read_results([out])
