@@ -131,10 +131,11 @@ def test_each_source_of_a_focal_length_has_its_deviation():
 
 
 @pytest.mark.parametrize(
-    ("minimum", "share", "std"), [(0.01, 0.5, 0.0071), (0.03, 0.88, 0.0096), (0.065, 0.97, 0.0101)]
+    ("minimum", "share", "std"),
+    [(0.01, 0.5, 0.0071), (0.021, 0.5, 0.0071), (0.03, 0.88, 0.0096), (0.065, 0.97, 0.0101)],
 )
 def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(monkeypatch, minimum, share, std):
-    """Beyond two deviations the picture says where to look next."""
+    """Beyond two deviations the picture says where to look next; from one on the pose's errors grow."""
     rgb, pose = _photo(pinhole(320, 240, TRUE))
     query = rooms.ask(_panorama(rgb, focal_px=TRUE), rooms.scan_map(SEED))
     information = np.diag([1.0 / 0.01**2, 0.0, 0.0, 0.0, 0.0])
@@ -146,6 +147,7 @@ def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(monkeypatch, 
     assert fit.conflict == pytest.approx(minimum / 0.01 / math.sqrt(2.0), rel=0.02)
     assert fit.change[0] / minimum == pytest.approx(share, abs=0.02)
     assert fit.deviation == pytest.approx(std, rel=0.03)
+    assert (fit.of_difference[0, 0] > 1e-6) == (minimum == 0.021)  # beyond two they are in the deviation
     nothing = found._replace(information=np.zeros((5, 5)))
     monkeypatch.setattr(focal, "estimate_lens", lambda *args: nothing)
     open_fit = focal.fit_focal(query, scan().from_world(pose))

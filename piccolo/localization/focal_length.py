@@ -88,6 +88,8 @@ class FocalFit(NamedTuple):
     # (6, 6) what all corrections would add if nothing that was given holds; None of a guess
     of_picture: Array | None = None
     contradicted: str = "log_focal"  # the correction of LENS in which both differ most
+    # (6, 6) what is added to the errors that are told if picture and claim differ by more than both say
+    of_difference: Array | None = None
 
     @property
     def deviation(self) -> float:
@@ -144,7 +146,7 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     opinions = estimate, free
     tests = [claim.contradict(*told[:2])[0] for told in opinions]
     worst = np.abs(tests).max(axis=0)
-    change, total = average(prior, claim, estimate, opinion, float(worst.max()))
+    change, total, difference = average(prior, claim, estimate, opinion, float(worst.max()))
     fitted = FITTED if fits_radial(prior, camera) else FITTED[:1]
     rest = [k for k in range(len(values)) if k not in fitted]
     spread = total[np.ix_(rest, rest)] + np.outer(change[rest], change[rest])
@@ -158,24 +160,27 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         np.asarray(motion[:, rest] @ spread @ motion[:, rest].T),
         None if prior.is_measured or prior.deviation > WIDE else find_errors_of_picture(free, claim),
         LENS[int(worst.argmax())],
+        motion @ difference @ motion.T,
     )
 
 
 def average(
     prior: FocalPrior, claim: Claim, estimate: Estimate, opinion: Opinion | None, conflict: float
-) -> tuple[Array, Array]:
-    """Return the mean (5,) of picture and claim, and its covariance (5, 5).
+) -> tuple[Array, Array, Array]:
+    """Return the mean (5,) of picture and claim, its covariance (5, 5), and what both differ too much.
 
-    The variance of a focal length that was given grows by what both disagree, if that is not by chance.
+    The variance of a focal length that was given grows by that if it is not by chance.
     """
     precision = claim.precision
-    if opinion is not None and conflict > DISAGREE:  # then the picture says where to look next
+    wide = precision.copy()
+    if opinion is not None and not prior.is_measured:
         # as by DerSimonian and Laird (1986)
-        excess = max(opinion.off**2 - opinion.variance - prior.deviation**2, 0.0)
-        precision[FOCAL] = 1.0 / (prior.deviation**2 + (0.0 if prior.is_measured else excess))
+        wide[FOCAL] = 1.0 / max(opinion.off**2 - opinion.variance, prior.deviation**2)
+    if conflict > DISAGREE:
+        precision = wide  # the picture says where to look next
     goal = estimate.information @ estimate.values + precision * claim.expected
     total = np.linalg.inv(estimate.information + np.diag(precision))
-    return total @ goal, np.asarray(total)
+    return total @ goal, np.asarray(total), np.linalg.inv(estimate.information + np.diag(wide)) - total
 
 
 def find_errors_of_picture(estimate: Estimate, claim: Claim) -> Array:

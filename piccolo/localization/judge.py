@@ -111,6 +111,8 @@ def judge(query: Query, found: Selection, fit: Fit | None = None, may_promote: b
         fit = fit_focal(query, found.best.pose, is_first=False) if isinstance(fit, FocalFit) else fit
         return judge(query, found, fit, may_promote=False)
     fit = doubt_alone(fit, measured.errors.gaussian)
+    if isinstance(fit, FocalFit) and fit.of_difference is not None:
+        measured = measured._replace(errors=measured.errors.widen(fit.of_difference))
     return conclude(query, replace(found, alternatives=reported), fit, measured, standings, probabilities)
 
 
