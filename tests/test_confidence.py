@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import rooms
 from made_up import at
-from piccolo.problem.settings import CoarseToFineSettings
 from rooms import as_panorama
 
 from piccolo.errors import InputError
@@ -16,6 +15,7 @@ from piccolo.judge.belief import make_belief
 from piccolo.judge.pose_covariance import PoseCovariance, least_constrained_direction
 from piccolo.judge.probability import Standing, classify, posterior
 from piccolo.paper.localize import PaperSettings
+from piccolo.problem.settings import CoarseToFineSettings
 
 SURE = 0.002  # [m] largest deviation
 RIGHT, WRONG = Standing(1.0, 0.8, 60, "drawn scan"), Standing(1.0, 0.03, 3, "drawn scan")

@@ -133,7 +133,8 @@ def test_each_source_of_a_focal_length_has_its_deviation():
 
 
 @pytest.mark.parametrize(
-    ("minimum", "share", "std"), [(0.01, 0.5, 0.0071), (0.03, 0.88, 0.0096), (0.065, 0.97, 0.0101)]
+    ("minimum", "share", "std"),
+    [(0.01, 0.5, 0.0071), (0.021, 0.5, 0.0071), (0.03, 0.88, 0.0096), (0.065, 0.97, 0.0101)],
 )
 def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(minimum, share, std):
     """Beyond two deviations the picture says where to look next."""
@@ -145,9 +146,25 @@ def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(minimum, shar
     assert fit.conflict == pytest.approx(minimum / 0.01 / math.sqrt(2.0), rel=0.02)
     assert fit.change[0] / minimum == pytest.approx(share, abs=0.02)
     assert fit.deviation == pytest.approx(std, rel=0.03)
+    assert (fit.of_difference[0, 0] > 1e-6) == (minimum == 0.021)  # beyond two they are in the deviation
     nothing = found._replace(information=np.zeros((5, 5)))
     open_fit = focal.weigh_claim(panorama.focal_prior, camera, nothing, nothing)
     assert (open_fit.change[0], open_fit.deviation, open_fit.conflict) == (0.0, pytest.approx(0.01), 0.0)
+
+
+def test_what_other_photos_tell_is_not_doubted_by_one_of_them():
+    """Its confidence would follow a millimetre of theirs: from 3.3 to 4 deviations a doubt is 0.4 to 0.9."""
+    given = _panorama(_photo(pinhole(320, 240, TRUE))[0], focal_px=TRUE)
+    first = np.eye(5)[0]
+    found = Estimate(0.04 * first, np.diag(1e4 * first), np.ones((6, 5)))
+    by_others = given.expect_focal(TRUE, 0.004)
+    alone, beside = (
+        focal.weigh_claim(panorama.focal_prior, panorama.cameras[0].camera, found, found)
+        for panorama in (given, by_others)
+    )
+    assert alone.doubt > 0.1
+    assert beside.doubt == 0.0
+    assert beside.conflict == pytest.approx(0.04 / math.hypot(0.01, 0.004), rel=0.02)
 
 
 def test_matches_lead_to_a_focal_length_that_is_far_off():

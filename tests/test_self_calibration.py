@@ -1,6 +1,7 @@
 """Pose and corrections of a picture's geometry, fitted together: equations, claims, bent panoramas."""
 
 import math
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -12,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from piccolo.camera import Camera, Mount
 from piccolo.camera.corrections import Corrections
 from piccolo.camera.model import pinhole, whole_sphere
-from piccolo.evidence.self_calibration import Estimate
+from piccolo.evidence.self_calibration import Estimate, FreeEnd, displace_blocks
 from piccolo.evidence.sphere import CLAIM, SphereFit, count_deviations
-from piccolo.geometry.pose import exp_so3
+from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.pose_gaussian import probability_of_ball
 from piccolo.geometry.sphere import compute_pixels
 from piccolo.judge.claim import Claim, marginal
@@ -138,6 +139,42 @@ def test_sums_by_part_add_up_and_matrices_are_symmetric():
         np.testing.assert_allclose(several.sum(axis=0), one[0], rtol=1e-5, atol=1e-3)
     np.testing.assert_array_equal(whole.matrices, whole.matrices.transpose(0, 2, 1))
     assert np.linalg.eigvalsh(whole.matrices[0])[0] >= -1e-6 * whole.matrices[0].max()
+
+
+def test_displaced_blocks_move_the_corrections_as_descents_with_displaced_points_do():
+    """By a step of Gauss and Newton, from a pose at which each point has the colour that it shows."""
+    mount = LENSES["pinhole"]
+    corrections = Corrections(mount)
+    problem = _problem(mount)
+    problem = problem._replace(points=problem.points[:, np.argsort(problem.points[1] / problem.points[0])])
+    pose = Pose(Rotation.from_rotvec([0.4, -0.3, 1.2]).as_matrix(), np.array([2.0, -1.0, 0.5]))
+    texels = problem.texels.reshape(-1, problem.width + 2)
+    image = np.float32([(texels >> shift) & 255 for shift in (0, 8, 16)])
+    rays = problem.points.T.astype(float) / np.linalg.norm(problem.points, axis=0)[:, None]
+    u, v = compute_pixels(rays, problem.width)
+    places = np.float32(u + 0.5), np.float32(v + 0.5)  # a column and a row of padding come before the pixels
+    shown = np.stack([cv2.remap(one, *places, cv2.INTER_LINEAR).ravel() for one in image])
+    problem = problem._replace(channels=shown)
+    begins = np.array([0, 4000, 9000, problem.points.shape[1]])
+
+    def evaluate(points_cam):
+        displaced = corrections.displace(points_cam, np.zeros(5))
+        return sum_free_equations(problem._replace(points=displaced.points), displaced.moves, begins)
+
+    sums = evaluate(problem.points)
+    move = np.array([0.006, -0.004, 0.008])  # [m] in the map
+    expected = np.zeros((5, 5))
+    for begin, end in pairwise(begins):
+        ends = []
+        for sign in (1.0, -1.0):
+            points = problem.points.copy()
+            points[:, begin:end] += np.float32(sign * pose.R_cam_from_world @ move)[:, None]
+            ends.append(evaluate(points).gradients.sum(axis=0))
+        step = -np.linalg.solve(sums.matrices.sum(axis=0), 0.5 * (ends[0] - ends[1]))
+        expected += np.outer(step[6:], step[6:])
+    found = displace_blocks(FreeEnd(pose, np.zeros(5), 0.0, sums), np.outer(move, move))
+    np.testing.assert_allclose(found, expected, atol=0.05 * np.abs(expected).max())
+    assert found[0, 0] == pytest.approx(expected[0, 0], rel=0.1)
 
 
 def _claim(count=2):

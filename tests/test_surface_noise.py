@@ -1,9 +1,11 @@
+import math
+
 import numpy as np
 import pytest
 import rooms
 
 from piccolo.cloud.octree import build_octree
-from piccolo.cloud.surfaces import NOISE_SHARE, surface_variance
+from piccolo.cloud.surfaces import NOISE_SHARE, UNKNOWN_DISPLACEMENT, displacement, surface_variance
 
 SIZE = np.array([5.0, 4.0, 2.6])  # [m] of a room turned by 20 degrees, so that no wall is along an axis
 TURN = np.array([[0.9397, -0.342, 0.0], [0.342, 0.9397, 0.0], [0.0, 0.0, 1.0]])
@@ -50,3 +52,25 @@ def test_a_doubled_scan_has_half_the_gap_along_the_shift_alone(gap):
 
 def test_too_few_points_tell_nothing():
     assert _deviations(_room(300))[0].max() == 0.0
+
+
+def _displacement_of_waves(height):
+    """Of a noisy wall with waves of a metre, and so high [m]."""
+    rng = np.random.default_rng(4)
+    across = rng.uniform(-2.5, 2.5, (300_000, 2))
+    waves = height * np.sin(math.tau * across).sum(axis=1)
+    points = np.column_stack([across, waves + rng.normal(0.0, 0.003, len(across))])
+    return displacement(build_octree(rooms.voxels(points)))
+
+
+def test_surfaces_of_a_wavy_scan_are_displaced():
+    """As far as it is wavy; noise, to which no size adds, is no wave."""
+    assert _displacement_of_waves(0.0) < 0.003
+    low = _displacement_of_waves(0.01)
+    assert 0.004 < low < 0.01
+    assert _displacement_of_waves(0.02) == pytest.approx(2.0 * low, rel=0.3)
+
+
+def test_a_scan_without_flat_cells_has_displacements_that_nobody_knows():
+    points = np.random.default_rng(5).uniform(-1.0, 1.0, (50_000, 3))
+    assert displacement(build_octree(rooms.voxels(points))) == UNKNOWN_DISPLACEMENT

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 import rooms
-from piccolo.problem.settings import CoarseToFineSettings
 from pictures import encoded, write
 from refusals import assert_input_error
 from test_priors import write_photo
@@ -22,6 +21,7 @@ from piccolo.judge.belief import make_belief
 from piccolo.judge.localization import Alternative, Evidence, Localization
 from piccolo.judge.reasons import Reason
 from piccolo.photo import Photo
+from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.walk.frames import MOST_ODDS, Frame, State, list_states
 from piccolo.walk.path import Ranked
 from piccolo.walk.results import check_odometry, make_localization, smooth_positions

@@ -9,11 +9,13 @@ Noise is similar at all points and averages out over those that a photo shows, b
 scans are shifted against each other, each surface is there twice, and a pose may follow one or the other.
 """
 
+import math
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Array32, Int32s, Integers
+from ..arrays import Array, Array32, Int64s, Integers
 from ..geometry.colors import colors_of_edges
 from ..geometry.robust import weigh_absolute
 from ..jobs.threads import Workers
@@ -32,6 +34,9 @@ SOME_CELLS = 1000  # at a time
 NOISE_SHARE = 0.3  # of the noise's deviation that is left in a pose, from trials with noise of 1 to 5 cm
 ONE_SHEET = 2.5  # kurtosis of noise within a cell, about; of two thin sheets it is 1
 ROUGHNESS = 0.005  # [m] of clean surfaces and the things on them
+FLAT = 0.03  # least ratio of the two smaller variances of a cell that is not flat
+SURFACE = 1.28  # [m] chosen: size of surfaces, which are displaced against each other
+UNKNOWN_DISPLACEMENT = 0.01  # [m] chosen
 NUM_ITERATIONS = 20
 LEAST_RESIDUAL = 1e-5  # [m^2] of cells that fit, all alike
 RIDGE = 3e-3  # on the squared norm of the tensor: two walls at a right angle leave a part undetermined
@@ -142,41 +147,77 @@ def residual_moments(octree: Octree, levels_up: int) -> tuple[Array, Array]:
 
     The variances [m^2] are across the planes.
     """
+    found = [(np.empty((0, 3)), np.empty(0))]
+    found += map(moments_of_cells, fit_planes(octree, levels_up))
+    normals, variances = map(np.concatenate, zip(*found, strict=True))
+    return normals, variances
+
+
+class Planes(NamedTuple):
+    """Planes through the leaves of some cells."""
+
+    offsets: Array  # (N, 3) [m] of the leaves from their cell's middle, cell by cell
+    counts: Int64s  # (C,) leaves of each cell
+    variances: Array  # (C, 3) [m^2] along the axes; the first is that across the plane
+    axes: Array  # (C, 3, 3) in columns
+
+
+def fit_planes(octree: Octree, levels_up: int) -> Iterator[Planes]:
+    """Yield planes through the leaves of the fuller cells of a level, of some cells at a time.
+
+    Of more than MAX_CELLS, so many are taken.
+    """
     level = len(octree.level_start) - 2 - levels_up
     edges = np.arange(octree.level_start[level], octree.level_start[level + 1] + 1)
     for _ in range(levels_up):
         edges = octree.first_child[edges]
     full = np.flatnonzero(np.diff(edges) >= MIN_LEAVES)
     full = full[np.linspace(0, len(full) - 1, min(len(full), MAX_CELLS)).astype(np.int64)]
-    found = [(np.empty((0, 3)), np.empty(0))]
     for begin in range(0, len(full), SOME_CELLS):
         some = full[begin : begin + SOME_CELLS]
-        found.append(moments_of_cells(octree.nodes, edges[some], edges[some + 1]))
-    normals, variances = map(np.concatenate, zip(*found, strict=True))
-    return normals, variances
+        counts = (edges[some + 1] - edges[some]).astype(np.int64)
+        first = np.cumsum(counts) - counts
+        which = np.arange(counts.sum()) + np.repeat(edges[some] - first, counts)
+        leaves: Array = octree.nodes[which, :3].astype(np.float64)
+        offsets = leaves - np.repeat(np.add.reduceat(leaves, first) / counts[:, None], counts, axis=0)
+        products = (offsets[:, :, None] * offsets[:, None, :]).reshape(-1, 9)
+        moments = (np.add.reduceat(products, first) / counts[:, None]).reshape(-1, 3, 3)
+        yield Planes(offsets, counts, *np.linalg.eigh(moments))
 
 
-def moments_of_cells(nodes: Array32, begins: Int32s, ends: Int32s) -> tuple[Array, Array]:
-    """Return normals (C, 3) and variances (C,) of cells, each with the leaves from its begin to its end.
+def moments_of_cells(planes: Planes) -> tuple[Array, Array]:
+    """Return normals (C, 3) and variances (C,) of cells by the planes through their leaves.
 
     The residuals of one noisy sheet have a kurtosis of 3, less what the cell cuts off; those of two sheets at
     +-b with noise of variance s^2 have E r^4 = 3 (b^2 + s^2)^2 - 2 b^4. The result is b^2 and a part of s^2.
     """
-    counts = (ends - begins).astype(np.int64)
-    first = np.cumsum(counts) - counts
-    leaves = nodes[np.arange(counts.sum()) + np.repeat(begins - first, counts), :3].astype(np.float64)
+    offsets, counts, variances, axes = planes
     cell = np.repeat(np.arange(len(counts)), counts)
-    offsets = leaves - (np.add.reduceat(leaves, first) / counts[:, None])[cell]
-    products = (offsets[:, :, None] * offsets[:, None, :]).reshape(-1, 9)
-    moments = (np.add.reduceat(products, first) / counts[:, None]).reshape(-1, 3, 3)
-    variances, axes = np.linalg.eigh(moments)
     normals = axes[:, :, 0]
     across = np.maximum(variances[:, 0], ROUGHNESS**2)
     residuals = np.einsum("ij,ij->i", offsets, normals[cell])
-    kurtosis = np.add.reduceat(residuals**4, first) / counts / across**2
+    kurtosis = np.bincount(cell, residuals**4) / counts / across**2
     across -= ROUGHNESS**2
     of_sheets = np.sqrt(np.clip((ONE_SHEET - kurtosis) / (ONE_SHEET - 1.0), 0.0, 1.0)) * across
     return normals, of_sheets + NOISE_SHARE**2 * (across - of_sheets)
+
+
+def displacement(octree: Octree) -> float:
+    """Return the deviation [m] of a scan's surfaces from where they are, of each against the others.
+
+    Scans that drift are wavy: flat cells of twice the size are less flat, where noise stays the same. What is
+    added from one size to the next is taken on to cells of a surface's size, in proportion. It is
+    UNKNOWN_DISPLACEMENT for a scan with too few flat cells.
+    """
+    variances = []
+    for levels_up in CELLS:
+        found = [planes.variances for planes in fit_planes(octree, levels_up)]
+        across = [v[v[:, 0] < FLAT * v[:, 1], 0] for v in found]
+        if sum(map(len, across)) < MIN_CELLS:
+            return UNKNOWN_DISPLACEMENT
+        variances.append(float(np.median(np.concatenate(across))))
+    size = octree.leaf_size * 2 ** CELLS[-1]
+    return float(SURFACE / size * math.sqrt(max(variances[1] - variances[0], 0.0)))
 
 
 def fit_tensor(normals: Array, variances: Array) -> Array:

@@ -33,13 +33,15 @@ from ..problem.problem import Problem
 from ..problem.stages import Limits
 from ..views.view import Cells
 from .comparison import mask_occluders
-from .covariance import UNCALIBRATED
+from .covariance import UNCALIBRATED, compute_median_range
 from .lens_matches import MOST, MatchFit, add_matches, fit_matches
+from .scan_errors import displacement_variance
 from .self_calibration import (
     Estimate,
     Freedom,
     FreeEnd,
     descend_freely,
+    displace_blocks,
     estimate_corrections,
     invert,
 )
@@ -62,12 +64,7 @@ MOST_VARIANCE = 1.0  # of a focal length's logarithm: with more, the picture say
 FOCAL_WIDTHS = (0.5, *CALIBRATED)
 ALL_WIDTHS = (0.1, 0.05, 0.02, 0.02, 0.1)
 DISAGREE = 2.0  # deviations between picture and what was given, by which chance parts them in one of twenty
-# of the covariance where all corrections are free, so that right calibrations of 91 crops differ from what is
-# found as chance has it
-INFLATION_OF_ALL = 2.0
-# [px] of the sphere at the picture's edge, which all blocks may have in common; with 0.4 of the focal length
-# a right calibration was called wrong in the real corridor of tests/data
-EDGE_ERRORS = (0.6, 0.2, 0.2, 0.2, 0.4)
+EDGE_ERROR = 0.2  # chosen: [px] of the sphere at the picture's edge, which all blocks may have in common
 UNCONFIRMED = 0.1  # chosen: weight of a photo's own focal length, against the one given, in what it confirms
 AT_REST = 0.5  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
@@ -84,11 +81,13 @@ class FocalFit(NamedTuple):
     motion: Array  # (6, p) of a pose with it: rotation about the camera's axes [rad], centre in the map [m]
     opinion: Opinion | None  # what the picture alone says; None if it says nothing
     conflict: float  # deviations between that and what was given; 0 if it says nothing
-    doubt: float = 0.0  # as of FocalLength
+    doubt: float = 0.0  # as of FocalLength; none of what other photos of the camera tell
     of_rest: Array | None = None  # (6, 6) what the other corrections add to the covariance of a pose
     # (6, 6) what all corrections would add if nothing that was given holds; None of a guess
     of_picture: Array | None = None
     contradicted: str = "log_focal"  # the correction of LENS in which both differ most
+    # (6, 6) what is added to the errors that are told if picture and claim differ by more than both say
+    of_difference: Array | None = None
 
     @property
     def deviation(self) -> float:
@@ -128,12 +127,13 @@ class FocalFit(NamedTuple):
 def doubt_unconfirmed(fit: FocalFit, gaussian: PoseGaussian | None) -> FocalFit:
     """Return the fit of a photo by itself, doubted more where the photo does not confirm what was given.
 
-    If what was given says nothing, the pose is only as exact as by the photo's own focal length.
+    If what was given says nothing, the pose is only as exact as by the photo's own focal length. Both doubts
+    are about the same wrong claims: the greater one counts.
     """
     if fit.of_picture is None or gaussian is None:
         return fit
     missed = 1.0 - probability_within(gaussian.widen(fit.of_picture))
-    return fit._replace(doubt=1.0 - (1.0 - fit.doubt) * (1.0 - UNCONFIRMED * missed))
+    return fit._replace(doubt=max(fit.doubt, UNCONFIRMED * missed))
 
 
 def fit_focal(problem: Problem, best: Candidate, workers: Workers, is_first: bool = True) -> FocalFit:
@@ -150,7 +150,7 @@ def fit_focal(problem: Problem, best: Candidate, workers: Workers, is_first: boo
     starts = fit_matches(mount, best.pose, matches, ALL_WIDTHS)
     near, far = descend_lens(problem, best, claim, starts, workers, is_first)
     by_matches = fit_matches(mount, best.pose, matches, FOCAL_WIDTHS)
-    estimate = add_matches(estimate_lens(problem, best.pose, near), by_matches)
+    estimate = estimate_lens(problem, best.pose, near, by_matches)
     return weigh_claim(prior, camera, estimate, estimate_lens(problem, best.pose, far))
 
 
@@ -164,10 +164,10 @@ def weigh_claim(prior: FocalPrior, camera: Camera, estimate: Estimate, free: Est
     off, variance = marginal(values, information, claim, FOCAL)
     off -= claim.expected[FOCAL]
     opinion = Opinion(off, variance) if variance < MOST_VARIANCE else None
-    opinions = estimate, free._replace(information=free.information / INFLATION_OF_ALL)
+    opinions = estimate, free
     tests = [claim.contradict(*told[:2])[0] for told in opinions]
     worst = np.abs(tests).max(axis=0)
-    change, total = average(prior, claim, estimate, opinion, float(worst.max()))
+    change, total, difference = average(prior, claim, estimate, opinion, float(worst.max()))
     fitted = FITTED if fits_radial(prior, camera) else FITTED[:1]
     rest = [k for k in range(len(values)) if k not in fitted]
     spread = total[np.ix_(rest, rest)] + np.outer(change[rest], change[rest])
@@ -177,10 +177,11 @@ def weigh_claim(prior: FocalPrior, camera: Camera, estimate: Estimate, free: Est
         motion[:, fitted],
         opinion,
         float(worst.max()),
-        max(claim.doubt(*told[:2]) for told in opinions),
+        0.0 if prior.is_measured else max(claim.doubt(*told[:2]) for told in opinions),
         np.asarray(motion[:, rest] @ spread @ motion[:, rest].T),
         None if prior.is_measured or prior.deviation > WIDE else find_errors_of_picture(free, claim),
         LENS[int(worst.argmax())],
+        motion @ difference @ motion.T,
     )
 
 
@@ -193,22 +194,21 @@ def list_matches(problem: Problem, candidate: Candidate, workers: Workers) -> Ma
 
 def average(
     prior: FocalPrior, claim: Claim, estimate: Estimate, opinion: Opinion | None, conflict: float
-) -> tuple[Array, Array]:
-    """Return the mean (5,) of picture and claim, and its covariance (5, 5).
+) -> tuple[Array, Array, Array]:
+    """Return the mean (5,) of picture and claim, its covariance (5, 5), and what both differ too much.
 
-    The variance of a focal length that was given grows by what both disagree too much.
+    The variance of a focal length that was given grows by that if it is not by chance.
     """
     precision = claim.precision
     wide = precision.copy()
-    if opinion is not None:
+    if opinion is not None and not prior.is_measured:
         # as by DerSimonian and Laird (1986)
-        excess = max(opinion.off**2 - opinion.variance - prior.deviation**2, 0.0)
-        wide[FOCAL] = 1.0 / (prior.deviation**2 + (0.0 if prior.is_measured else excess))
+        wide[FOCAL] = 1.0 / max(opinion.off**2 - opinion.variance, prior.deviation**2)
     if conflict > DISAGREE:
         precision = wide  # the picture says where to look next
     goal = estimate.information @ estimate.values + precision * claim.expected
-    change = np.linalg.inv(estimate.information + np.diag(precision)) @ goal
-    return change, np.asarray(np.linalg.inv(estimate.information + np.diag(wide)))
+    total = np.linalg.inv(estimate.information + np.diag(precision))
+    return total @ goal, np.asarray(total), np.linalg.inv(estimate.information + np.diag(wide)) - total
 
 
 def find_errors_of_picture(estimate: Estimate, claim: Claim) -> Array:
@@ -301,17 +301,27 @@ def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
     return points._replace(weights=points.weights * is_kept.astype(np.float32))
 
 
-def estimate_lens(problem: Problem, pose: Pose, end: FreeEnd) -> Estimate:
+def estimate_lens(problem: Problem, pose: Pose, end: FreeEnd, by_matches: MatchFit | None = None) -> Estimate:
     """Estimate the corrections of a lens at the end of a descent from a pose, which tells nothing if it left.
 
-    Errors of the picture's edge that all blocks may have in common are added.
+    Added are errors of the picture's edge that all blocks may have in common and, as those of the matches
+    too, those of the scan.
     """
     estimate = estimate_corrections(end)
     if end.pose.distance(pose) > FAR:
-        return estimate._replace(information=np.zeros_like(estimate.information))
+        estimate = estimate._replace(information=np.zeros_like(estimate.information))
     camera = problem.given.cameras[0].camera
     per_px = math.tau * camera.focal[0] / (0.5 * camera.width * problem.photo.panorama.rgb.shape[1])
-    covariance = invert(estimate.information)
+    estimate = add_errors(estimate, (EDGE_ERROR * per_px) ** 2 * np.eye(len(LENS)))
+    if by_matches is not None:
+        estimate = add_matches(estimate, by_matches)
+    median_range = compute_median_range(problem.view_at(pose, "points"))
+    variance = displacement_variance(problem.scan_map, pose, median_range)
+    return add_errors(estimate, displace_blocks(end, variance))
+
+
+def add_errors(estimate: Estimate, errors: Array) -> Estimate:
+    """Return an estimate with further errors (5, 5); what it does not tell stays so."""
     is_known = estimate.information.any(axis=1)
-    errors = np.diag(is_known * (np.array(EDGE_ERRORS) * per_px) ** 2)
-    return estimate._replace(information=invert(covariance + errors))
+    covariance = invert(estimate.information) + errors * np.outer(is_known, is_known)
+    return estimate._replace(information=invert(covariance))

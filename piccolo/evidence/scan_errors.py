@@ -35,3 +35,9 @@ def layer_covariance(scan_map: ScanMap, pose: Pose, median_range: float) -> Arra
         return np.zeros((6, 6))
     variance = gap_variance(scan_map.layers, pose.center_world, median_range)
     return np.diag(np.repeat([variance / median_range**2, variance], 3))
+
+
+def displacement_variance(scan_map: ScanMap, pose: Pose, median_range: float) -> Array:
+    """Return the covariance (3, 3) [m^2], in the map's axes, by which surfaces lie beside where they are."""
+    common = scan_covariance(scan_map, median_range) + layer_covariance(scan_map, pose, median_range)
+    return common[3:, 3:] + scan_map.displacement**2 * np.eye(3)

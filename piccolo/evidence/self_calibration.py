@@ -132,6 +132,19 @@ def estimate_corrections(end: FreeEnd, curvature: float = CURVATURE) -> Estimate
     return Estimate(end.values, invert(covariance), np.asarray(motion))
 
 
+def displace_blocks(end: FreeEnd, variance: Array) -> Array:
+    """Return the covariance (p, p) of the corrections by surfaces of the scan that are displaced.
+
+    What is seen in each block is displaced by itself, with the covariance `variance` (3, 3) [m^2] in the map.
+    It is as if the camera had moved the other way for the block's points alone, so that the slopes change by
+    the block's part of the normal equations.
+    """
+    R = end.pose.R_cam_from_world
+    inverse = np.linalg.pinv(end.sums.matrices.sum(axis=0))
+    by_move = inverse[NUM_OF_POSE:] @ end.sums.matrices[:, :, 3:NUM_OF_POSE]  # (B, p, 3) [1 / m]
+    return np.asarray(np.einsum("bik,kl,bjl->ij", by_move, R @ variance @ R.T, by_move))
+
+
 def invert(matrix: Array) -> Array:
     """Return the inverse (p, p) of a covariance or of its inverse; 0 in directions in which that is 0."""
     found = np.linalg.pinv(matrix, hermitian=True)

@@ -59,10 +59,12 @@ def judge(found: Found, means: Means, min_confidence: float, may_promote: bool =
     if likeliest and is_copy[likeliest] and may_promote:
         other = promote(problem, selection, reported.candidates[likeliest], fit, workers)
         return judge(other, means, min_confidence, may_promote=False)
+    belief = make_belief(places, probability_within(measured.errors.gaussian))
     if isinstance(fit, FocalFit):
         fit = doubt_unconfirmed(fit, measured.errors.gaussian)
+        if fit.of_difference is not None:
+            measured = measured._replace(errors=measured.errors.widen(fit.of_difference))
     case = Case(reported, tuple(standings), measured, fit and describe_geometry(problem, fit))
-    belief = make_belief(places, probability_within(measured.errors.gaussian))
     return decide_case(problem, case, belief, means, min_confidence)
 
 

@@ -13,7 +13,7 @@ from ..cloud.octree import Octree, build_octree
 from ..cloud.settings import R_z_from_axis, UpAxis
 from ..cloud.soa import MapFrame, PackedPoints, pack_points
 from ..cloud.stream import CloudStream
-from ..cloud.surfaces import paint_shape, surface_variance
+from ..cloud.surfaces import displacement, paint_shape, surface_variance
 from ..errors import InputError
 from ..geometry.pose import Pose
 from ..gravity.alignment import find_up, find_yaw_of_walls
@@ -67,6 +67,11 @@ class ScanMap(MapFrame):
         """True for a map of shape whose points differ in intensity too."""
         luminance = self.octree.level(COARSE_SPACING)[:, 3:].mean(axis=1)
         return self.has_shape and float(luminance.std()) > LEAST_DEVIATION
+
+    @cached_property
+    def displacement(self) -> float:
+        """Deviation [m] of surfaces from where they are, of each against the others."""
+        return displacement(self.octree)
 
     @cached_property
     def storeys(self) -> Storeys:
