@@ -194,7 +194,7 @@ def test_a_photo_that_was_turned_over_is_told(fov_deg, asks_map):
     right = _problem(rgb, outside)
     turned_over = _problem(rgb[:, ::-1].copy(), None if outside is None else outside[:, ::-1].copy())
     if not asks_map:
-        right, turned_over = (one.without_features() for one in (right, turned_over))
+        right, turned_over = (one.without_map_features() for one in (right, turned_over))
     assert right.photo.is_partial == turned_over.photo.is_partial == (fov_deg is not None)
     found = examine(right, _clean()[1])
     assert found.score > 0.9

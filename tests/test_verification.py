@@ -22,7 +22,7 @@ from piccolo.geometry.pose_gaussian import LIKELY, subtract
 from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.judge.candidate import Drawn
-from piccolo.judge.selection import find_rivals
+from piccolo.judge.selection import list_drawn
 from piccolo.local_features import matching
 from piccolo.local_features.hypotheses import count_matches
 from piccolo.local_features.keypoints import Keypoints
@@ -354,9 +354,9 @@ def test_a_pose_that_explains_less_than_half_of_a_sure_one_is_not_drawn(count, e
     """Of a whole photo, the scan is drawn at four others at most."""
     scores = (0.8, 0.5, 0.4, 0.39, 0.3, 0.2, 0.1)
     ranked = [make_candidate(k, score, count) for k, score in enumerate(scores)]
-    assert find_rivals(PARTIAL, ranked) == [k <= expected for k in range(7)]
-    assert find_rivals(WHOLE, ranked) == [k <= min(expected, 4) for k in range(7)]
-    assert find_rivals(PARTIAL.by_views(), ranked) == [False] * 7
+    assert list_drawn(PARTIAL, ranked) == [k <= expected for k in range(7)]
+    assert list_drawn(WHOLE, ranked) == [k <= min(expected, 4) for k in range(7)]
+    assert list_drawn(PARTIAL.by_views(), ranked) == [False] * 7
 
 
 def test_the_least_distance_elsewhere_is_that_of_a_plain_search():

@@ -9,7 +9,7 @@ from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..jobs.threads import Workers
 from ..judge.candidate import Candidate, Selection
-from ..judge.selection import find_rivals, rank, select
+from ..judge.selection import list_drawn, rank, select
 from ..problem.problem import Problem
 from ..problem.profile import DRAWN_VIEW
 from .comparison import compare
@@ -32,7 +32,7 @@ def examine(problem: Problem, pose: Pose, near: Candidate | None = None) -> Cand
 def check_prior(problem: Problem, candidate: Candidate) -> Candidate:
     """Return a candidate with what was given that its pose contradicts."""
     found = contradictions(problem.scan_map, candidate.pose, problem.prior)
-    return replace(candidate, contradicted=found)
+    return replace(candidate, against_prior=found)
 
 
 def examine_each(problem: Problem, poses: Sequence[Pose], workers: Workers) -> list[Candidate]:
@@ -70,14 +70,17 @@ def complete(problem: Problem, found: Selection, workers: Workers) -> Selection:
     if not problem.profile.uses_matches:
         return found
     ranked = [fill(found.best), *found.alternatives]
-    is_rival = find_rivals(problem.profile, ranked)
+    is_rival = list_drawn(problem.profile, ranked)
     rivals = [h for h, is_one in zip(ranked, is_rival, strict=True) if is_one]
     filled = iter(workers.map(fill, rivals, "verify"))
     return found.take([next(filled) if is_one else h for h, is_one in zip(ranked, is_rival, strict=True)])
 
 
 def choose(problem: Problem, found: Selection, workers: Workers) -> Selection:
-    """Complete the evidence of ranked candidates, and select the best by all of it."""
+    """Complete the evidence of ranked candidates, and select the best by all of it; the only way to select.
+
+    It is completed once more for who reads the evidence beside another best; nothing is selected again.
+    """
     chosen = select(problem.profile, complete(problem, found, workers))
     return complete(problem, chosen, workers)
 

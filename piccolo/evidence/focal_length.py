@@ -85,7 +85,7 @@ class FocalFit(NamedTuple):
     of_rest: Array | None = None  # (6, 6) what the other corrections add to the covariance of a pose
     # (6, 6) what all corrections would add if nothing that was given holds; None of a guess
     of_picture: Array | None = None
-    contradicted: str = "log_focal"  # the correction of LENS in which both differ most
+    worst_correction: str = "log_focal"  # the correction of LENS in which both differ most
     # (6, 6) what is added to the errors that are told if picture and claim differ by more than both say
     of_difference: Array | None = None
 

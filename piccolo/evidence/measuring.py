@@ -67,5 +67,7 @@ def describe_geometry(problem: Problem, fit: Fit) -> Geometry:
     std = math.sqrt(float(np.linalg.eigvalsh(fit.pose_covariance[3:, 3:])[-1]))
     found = Geometry(problem.given.cameras, fit.doubt, fit.conflict, std)
     if isinstance(fit, FocalFit):
-        return found._replace(focal_length=fit.focal_length(problem.given), contradicted=fit.contradicted)
+        return found._replace(
+            focal_length=fit.focal_length(problem.given), worst_correction=fit.worst_correction
+        )
     return found if fit.is_claimed else found._replace(sphere=fit.describe())

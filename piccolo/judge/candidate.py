@@ -75,7 +75,7 @@ class Candidate:
     pose: Pose  # in the map
     score: float  # of `seen`
     seen: Comparison  # of the photo with the scan there
-    contradicted: tuple[Contradiction, ...] = ()  # what was given that the pose contradicts
+    against_prior: tuple[Contradiction, ...] = ()  # what was told that the pose contradicts
     num_matches: int | None = None  # features that agree with the drawn scan; None: it was not drawn
     edge_score: float | None = None  # of the edges drawn there, in a scan without colours
     is_climbed: bool = False  # no perturbation improves it

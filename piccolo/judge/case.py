@@ -44,7 +44,7 @@ class Geometry(NamedTuple):
     conflict: float  # deviations between picture and what was given
     std: float  # [m] of the position by it
     focal_length: FocalLength | None = None  # of a photo whose focal length was fitted
-    contradicted: str = ""  # of that, the correction of the lens in which picture and given differ most
+    worst_correction: str = ""  # of that, the correction of the lens in which picture and given differ most
     sphere: SphereGeometry | None = None  # of a panorama that is not as it claims
 
 

@@ -114,6 +114,6 @@ def explain_conflict(geometry: Geometry) -> str:
     focal = geometry.focal_length
     if focal is None:
         return NOT_AS_CLAIMED
-    if geometry.contradicted in OTHERS:
-        return f"the picture has another {OTHERS[geometry.contradicted]} than was given: check {focal.source}"
+    if geometry.worst_correction in OTHERS:
+        return f"the picture has another {OTHERS[geometry.worst_correction]} than was given: check {focal.source}"
     return contradict("the picture has", focal, focal.px)

@@ -28,10 +28,11 @@ def rank(candidates: Sequence[Candidate]) -> Selection:
     return Selection(best, tuple(alternative_poses(best, candidates, count=MAX_COMPARED)))
 
 
-def find_rivals(profile: Profile, ranked: Sequence[Candidate]) -> list[bool]:
-    """Return True for ranked candidates, the best first, whose matches count: there the scan is drawn.
+def list_drawn(profile: Profile, ranked: Sequence[Candidate]) -> list[bool]:
+    """Say at which of ranked candidates the scan must be drawn: the best, and those that could still beat it.
 
-    A pose that explains far less than one with which many features agree can't win.
+    The best comes first; its matches must be known. A pose that explains far less than one with which many
+    features agree can't win.
     """
     if not profile.uses_matches:
         return [False] * len(ranked)
@@ -46,7 +47,7 @@ def find_rivals(profile: Profile, ranked: Sequence[Candidate]) -> list[bool]:
 
 def count_matches(profile: Profile, ranked: Sequence[Candidate]) -> list[int]:
     """Return the matches of ranked candidates, the best first; 0 of those that can't win."""
-    counts = zip(ranked, find_rivals(profile, ranked), strict=True)
+    counts = zip(ranked, list_drawn(profile, ranked), strict=True)
     return [(h.num_matches or 0) if is_rival else 0 for h, is_rival in counts]
 
 
@@ -55,7 +56,7 @@ def assess_alone(profile: Profile, ranked: Sequence[Candidate]) -> list[Standing
 
     Poses that contradict the prior share the odds that the prior is wrong.
     """
-    is_wrong = [bool(h.contradicted) for h in ranked]
+    is_wrong = [bool(h.against_prior) for h in ranked]
     log_prior = math.log(CONTRADICTED / max(sum(is_wrong), 1))
     counts = count_matches(profile, ranked)
     standings = []

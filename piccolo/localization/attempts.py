@@ -59,10 +59,10 @@ def plan_attempts(problem: Problem) -> list[tuple[Problem, Attempt]]:
     any tilt, ask them first. Partial photos are mostly taken about level: with a tilt that is not known
     exactly, "known" searches about level.
     """
-    looks_first = bool(problem.features) and is_whole(problem)
+    looks_first = bool(problem.features) and can_look_first(problem)
     first: list[tuple[Problem, Attempt]] = []
     if looks_first:
-        first = [(problem.by_views(), look_first), (problem.without_features(), draw_found)]
+        first = [(problem.by_views(), look_first), (problem.without_map_features(), draw_found)]
     if problem.rotations is not None:
         first.append((problem, look_along_walls))
     parts = [problem.features[: k + 1] for k in range(len(problem.features))]
@@ -71,7 +71,7 @@ def plan_attempts(problem: Problem) -> list[tuple[Problem, Attempt]]:
         for part in parts
     ]
     by_views: list[tuple[Problem, Attempt]] = []
-    asked = problem.without_features() if looks_first else problem
+    asked = problem.without_map_features() if looks_first else problem
     is_partial = problem.profile.is_partial
     if is_partial or problem.gravity != "unknown":
         upright: Tilts = "level" if is_partial and not problem.photo.has_tilt else "known"
@@ -189,7 +189,7 @@ def add_verified(problem: Problem, candidates: list[Candidate], workers: Workers
 
 def search_beyond_prior(problem: Problem, scan_map: ScanMap, means: Means) -> list[Candidate]:
     """Search a whole photo without the prior: poses that agree with it must beat those that it excludes."""
-    is_asked = not problem.prior.is_empty and is_whole(problem)
+    is_asked = not problem.prior.is_empty and can_look_first(problem)
     if not is_asked:
         return []
     anywhere = replace(problem, scan_map=scan_map, prior=NOTHING_KNOWN)
@@ -220,8 +220,8 @@ def join_features(problem: Problem, workers: Workers) -> tuple[Keypoints, Matche
     return keypoints, join_matches([p.matches for p in parts], [len(p.keypoints.rays) for p in parts])
 
 
-def is_whole(problem: Problem) -> bool:
-    """Return True if the photo shows nearly the whole sphere, upright or at a known tilt."""
+def can_look_first(problem: Problem) -> bool:
+    """Return True if the photo shows nearly the whole sphere, and its tilt may be the known one."""
     return problem.gravity != "unknown" and not problem.profile.is_partial
 
 

@@ -9,7 +9,7 @@ from ..geometry.nearness import ONE_ANSWER
 from ..jobs.threads import Workers
 from ..judge.alternatives import MAX_ALTERNATIVES, suppress_near
 from ..judge.candidate import Candidate, Selection
-from ..judge.selection import find_rivals
+from ..judge.selection import list_drawn
 from ..problem.problem import Problem
 from ..problem.settings import Effort
 from .shape import find_alike
@@ -42,7 +42,7 @@ def list_copies(problem: Problem, found: Selection, workers: Workers) -> list[bo
     ranked = found.candidates
     if not problem.profile.uses_matches:
         return [False] * len(ranked)
-    is_rival = find_rivals(problem.profile, ranked)[1:]
+    is_rival = list_drawn(problem.profile, ranked)[1:]
     rivals = [h.pose for h in compress(found.alternatives, is_rival)]
     is_copy = iter(find_copies(problem, found.best.pose, rivals, workers))
     return [True, *(is_one and next(is_copy) for is_one in is_rival)]

@@ -55,7 +55,7 @@ def describe_candidate(problem: Problem, candidate: Candidate) -> Step:
         "contradicted_fraction": float(seen.visible_area[seen.contradicts].sum()) / max(area, 1e-9),
         "num_matches": candidate.num_matches,
         "edge_score": candidate.edge_score,
-        "contradicted": [contradiction.reason for contradiction in candidate.contradicted],
+        "against_prior": [contradiction.reason for contradiction in candidate.against_prior],
     }
 
 

@@ -66,8 +66,8 @@ class Problem:
         width: int = min(self.given.rgb.shape[1], self.photo.panorama.rgb.shape[1])
         return math.tau / width
 
-    def without_features(self) -> "Problem":
-        """Return the problem in which no features of the map are asked for poses."""
+    def without_map_features(self) -> "Problem":
+        """Return the problem in which no features of the map propose poses; those of the drawn scan count."""
         return replace(self, features=())
 
     def by_views(self) -> "Problem":
@@ -92,7 +92,7 @@ class Problem:
         """Return the problem of the mirrored photo, without features of the map and the prior's heading."""
         rotations = None if self.rotations is None else ACROSS @ self.rotations @ ACROSS
         return replace(
-            self.without_features(),
+            self.without_map_features(),
             photo=self.photo.mirror(),
             prior=self.prior.without_heading(),
             rotations=rotations,

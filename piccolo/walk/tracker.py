@@ -16,7 +16,7 @@ from ..judge.candidate import Selection
 from ..judge.probability import MODELS, Standing, pose_features, posterior
 from ..judge.selection import assess
 from ..judge.sure import SURE_ODDS
-from ..localization.attempts import is_whole
+from ..localization.attempts import can_look_first
 from ..localization.beam import Ends, descend_briefly, score_briefly, score_mirror, score_near
 from ..localization.localize import localize
 from ..localization.means import Means
@@ -190,7 +190,7 @@ class Tracker:
         """Search the whole scan for a frame, which is then a key frame."""
         frame.alone = localize(self.scan_map, panorama, self.settings, self.workers, Stopwatch())
         is_sure = frame.is_localized_alone
-        is_mirrored = not is_sure and is_whole(problem) and fits_mirror(problem, self.means)
+        is_mirrored = not is_sure and can_look_first(problem) and fits_mirror(problem, self.means)
         if found := [] if is_mirrored else list_states(self.scan_map, frame.alone):
             frame.how = "alone"
             frame.states = list_key_states(problem, found[:1] if is_sure else found, self.means, is_sure)
