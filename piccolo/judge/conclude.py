@@ -115,5 +115,6 @@ def explain_conflict(geometry: Geometry) -> str:
     if focal is None:
         return NOT_AS_CLAIMED
     if geometry.worst_correction in OTHERS:
-        return f"the picture has another {OTHERS[geometry.worst_correction]} than was given: check {focal.source}"
+        other = OTHERS[geometry.worst_correction]
+        return f"the picture has another {other} than was given: check {focal.source}"
     return contradict("the picture has", focal, focal.px)

@@ -62,8 +62,8 @@ class Profile:
     beam: Beam
     first: Stage  # of short descents from starts; a photo of a part needs more iterations
     clear_score: float  # least score of one pose alone that explains a whole photo: see docs/METHOD.md
-    # alternatives at which the scan is drawn at most; None: all that could win. Of a whole photo it is drawn in
-    # four views for each, and further ones never won
+    # alternatives at which the scan is drawn at most; None: all that could win. Of a whole photo it is drawn
+    # in four views for each, and further ones never won
     most_rivals: int | None
     discount: float = 1.0  # of scores by shape: of few blocks chance explains more
 
