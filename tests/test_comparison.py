@@ -121,7 +121,7 @@ def test_what_is_seen_from_a_pose_near_is_placed_as_it_is():
     beside = Pose(true_pose.R_cam_from_world, true_pose.center_world + np.array([0.015, -0.012, 0.0]))
     problem = _problem(rooms.query(1).rgb)
     problem.view_at(beside, "fine")
-    found = comparison.compare_from(problem, true_pose, beside)
+    found = comparison.compare(problem, true_pose, seen_from=beside)
     assert problem.views.averages.cache_info().misses == 1
     assert found.score == pytest.approx(seen.score, abs=0.02)
     assert found.score != seen.score

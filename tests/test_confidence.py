@@ -118,8 +118,8 @@ def test_lines_that_mean_nothing_are_refused(settings, value):
 def test_alternatives_are_apart_from_the_best_and_from_each_other():
     best = at(0.0, 0.9)
     near, turned, far, beside_far = at(0.4, 0.8), at(0.1, 0.3, 20.0), at(3.0, 0.5), at(3.2, 0.4)
-    assert alternatives.alternative_poses(best.pose, [best, near, turned, far, beside_far]) == [far, turned]
-    found = alternatives.alternative_poses(at(0, 1.0).pose, [at(2.0 * k, 0.5) for k in range(1, 20)])
+    assert alternatives.alternative_poses(best, [best, near, turned, far, beside_far]) == [far, turned]
+    found = alternatives.alternative_poses(at(0, 1.0), [at(2.0 * k, 0.5) for k in range(1, 20)])
     assert len(found) == alternatives.MAX_ALTERNATIVES
 
 

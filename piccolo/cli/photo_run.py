@@ -51,6 +51,10 @@ JOINT = ("walk", "video", "relative", "color_scan")  # options of photos that he
 Write = Callable[[str], object]
 
 
+def ignore_step(line: str) -> None:
+    """Write no step of a search: nobody asked for them."""
+
+
 @dataclass
 class Run:
     """A command's batch, and what it has done so far."""
@@ -63,6 +67,7 @@ class Run:
     counts: Counter[str]  # results written, by status
     cloud_sha256: str | None = None  # of the scan, when it has been opened
     doubtful: list[str] = field(default_factory=list)  # spheres that were not localized
+    write_step: Write = ignore_step  # of a search
 
     @property
     def looks_again(self) -> bool:
@@ -180,19 +185,29 @@ def record(run: Run, answer: Answer, write: Write) -> None:
         if path and png is not None:
             write_atomically(path / f"{name}.png" if path.is_dir() else path, png)
     execution.print_result(arguments, result, answer.warnings)
-    write_steps(arguments, answer)
+    write_steps(run, answer)
     write(result.to_json())
     run.counts[result.status] += 1
     if result.best_pose is not None and result.pose is None and not result.cameras:
         run.doubtful.append(result.pano)
 
 
-def write_steps(arguments: Arguments, answer: Answer) -> None:
-    """Append the steps of a photo's search to the file of --trace, if it was searched."""
-    if arguments.trace and answer.steps:
-        lines = [json.dumps({"pano": answer.result.pano, **step}) for step in answer.steps]
-        with arguments.trace.open("a", encoding="utf-8") as file:
-            file.write("\n".join(lines) + "\n")
+def write_steps(run: Run, answer: Answer) -> None:
+    """Write the steps of a photo's search to the file of --trace, if it is asked for."""
+    for step in answer.steps:
+        run.write_step(json.dumps({"pano": answer.result.pano, **step}))
+
+
+@contextmanager
+def tracing(run: Run) -> Iterator[None]:
+    """Write the steps of searches to the file of --trace, from its beginning, if it is given."""
+    path = run.arguments.trace
+    if path is None:
+        yield
+        return
+    with path.open("wb", buffering=0) as stream:
+        run.write_step = partial(write_line, stream.fileno(), path)
+        yield
 
 
 def localize_all(
@@ -348,13 +363,12 @@ def localize_photos(arguments: Arguments) -> int:
         with (
             execution.connecting(arguments) as cluster,
             execution.executing(arguments, run.localizer, num_jobs, cluster, opening) as place,
+            tracing(run),
             watch.stage("all"),
         ):
             executor, run.localizer = place
             if isinstance(output, FileOutput):
                 output.begin()
-            if arguments.trace:
-                arguments.trace.write_bytes(b"")
             rest = itertools.chain([first] if first else [], left)
             interruption = localize_all(run, records, rest, executor, output.write)
             if run.looks_again and not interruption.number:

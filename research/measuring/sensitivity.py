@@ -40,7 +40,7 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
     "judge.probability": ("LEAST_RATIO", "NOISE_MATCHES"),
     "evidence.occlusion": ("CONTRADICTING", "SIGMA_DEG"),
     "evidence.covariance": ("MOST_SCORE", "PIXEL_SHARE", "UNCALIBRATED_SHARE"),
-    "evidence.focal_length": ("INFLATION_OF_ALL",),
+    "evidence.focal_length": ("EDGE_ERROR",),
     "evidence.lens_matches": ("INFLATION", "MATCHED_DEVIATION"),
     "evidence.verification": ("COS_AGREE",),
     "judge.candidate": ("LEAST_SHARED",),
