@@ -15,8 +15,8 @@ from .report.build import ReportSettings as ReportSettings, write_report as writ
 from .result import Result as Result, Source as Source
 from .scan import Scan as Scan
 from .scan_walk import Walk as Walk
-from .walk.frames import Motion as Motion
-from .walk.path import Gap as Gap
-from .walk.results import Alone as Alone, WalkFrame as WalkFrame
+from .together.walk.frames import Motion as Motion
+from .together.walk.path import Gap as Gap
+from .together.walk.results import Alone as Alone, WalkFrame as WalkFrame
 
 __version__: str

@@ -20,9 +20,6 @@ from .jobs.memory import check_memory
 from .jobs.threads import Stopwatch, Workers
 from .judge.localization import FocalLength, Localization
 from .judge.probability import LOCALIZED, NOT_LOCALIZED
-from .localization.beside import SurePhoto, localize_beside, place_sure
-from .localization.bundle import localize_bundle
-from .localization.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
 from .localization.localize import has_guessed_focal, localize, localize_guessed
 from .localization.means import NO_TRACE, Trace
 from .localization.places import add_places
@@ -34,6 +31,9 @@ from .problem.problem import prepare_problem
 from .problem.settings import CoarseToFineSettings
 from .result import Result, Source, describe_failure, unreadable_result, with_localization
 from .scan_map.scan_map import ScanMap, check_within
+from .together.beside import SurePhoto, localize_beside, place_sure
+from .together.bundle import localize_bundle
+from .together.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
 
 LABELS_WARNING = "`labels`: the confidence was fitted to colours; with labels it is a rough estimate"
 MEMORY_OF_PHOTO = 8e7  # [byte] that a photo keeps while others of its bundle are localized

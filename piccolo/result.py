@@ -25,7 +25,7 @@ from .judge.localization import Alternative, Evidence, FocalLength, Localization
 from .judge.pose_covariance import PoseCovariance
 from .judge.probability import AMBIGUOUS, LOCALIZED
 from .photo import GpsPrior
-from .walk.results import WalkFrame
+from .together.walk.results import WalkFrame
 
 FORMAT = "piccolo-pose/12"
 POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")

@@ -12,14 +12,14 @@ from .cloud.soa import PackedPoints
 from .errors import InputError
 from .files.atomic import check_output
 from .geometry.pose import Gravity, Pose, check_pose
-from .localization.bundle_adjustment import RelativeScale
 from .opened_scan import OpenedScan, Settings, make_failed_result
 from .photo import File, Photo, Prior, as_photo
 from .result import Result
 from .scan_map.open_map import write_map
 from .scan_map.scan_map import ScanMap
 from .scan_walk import Walk
-from .walk.frames import Motion
+from .together.bundle_adjustment import RelativeScale
+from .together.walk.frames import Motion
 
 Picture = File | Bytes | Photo  # a path or an array (H, W, 3) is a photo without options
 

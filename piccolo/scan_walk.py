@@ -22,10 +22,10 @@ from .photo import File, Photo, as_photo
 from .problem.problem import Problem
 from .result import Result, with_localization
 from .scan_map.scan_map import check_within
-from .walk.frames import Frame, Motion, check_times
-from .walk.path import believe
-from .walk.results import WalkFrame, describe_frame, make_localization, make_localizations
-from .walk.tracker import Tracker
+from .together.walk.frames import Frame, Motion, check_times
+from .together.walk.path import believe
+from .together.walk.results import WalkFrame, describe_frame, make_localization, make_localizations
+from .together.walk.tracker import Tracker
 
 NO_REFINING = "`refine_focal`: not an option of walks; refine the focal length with a single photo"
 

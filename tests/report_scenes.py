@@ -10,9 +10,9 @@ from piccolo.jobs.threads import Workers
 from piccolo.judge.localization import Alternative, Evidence
 from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.result import Result, Source, unreadable_result
+from piccolo.together.walk.path import Gap
+from piccolo.together.walk.results import WalkFrame
 from piccolo.views.pictures import encode_image
-from piccolo.walk.path import Gap
-from piccolo.walk.results import WalkFrame
 from research.synthetic.world import make_world, photograph, pose_of_query, scan_world
 
 SIZE = np.array([4.5, 3.5, 2.5])

@@ -7,9 +7,9 @@ import pytest
 
 from piccolo.geometry.pose import Pose
 from piccolo.judge.belief import NOTHING, decide, make_belief
+from piccolo.judge.by_others import Shares, believe_beside, believe_together, share_place
 from piccolo.judge.localization import Alternative, Evidence, Localization
 from piccolo.judge.reasons import WORDS, Contradiction, Reason, explain
-from piccolo.judge.together import Shares, believe_beside, believe_together, share_place
 from piccolo.paper.localize import believe as believe_by_paper
 
 BELIEF = make_belief([0.9, 0.06], within=0.8, doubt=0.05)

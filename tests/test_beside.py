@@ -19,9 +19,9 @@ from piccolo.judge.localization import Localization
 from piccolo.judge.reasons import Reason
 from piccolo.local_features.hypotheses import exact_pose
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization.beside import Neighbor, SurePhoto, fuse, localize_beside
 from piccolo.localization.judging import Found
 from piccolo.photo import Prior
+from piccolo.together.beside import Neighbor, SurePhoto, fuse, localize_beside
 
 
 def test_a_photo_is_localized_beside_one_that_shows_the_same():

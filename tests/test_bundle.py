@@ -18,8 +18,10 @@ from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import Selection
 from piccolo.judge.localization import Alternative, Localization
 from piccolo.judge.reasons import Reason
-from piccolo.localization import bundle_search
-from piccolo.localization.bundle import (
+from piccolo.localization.judging import Found
+from piccolo.panorama import Panorama
+from piccolo.together import bundle_search
+from piccolo.together.bundle import (
     CONTRADICTS,
     NOT_FOUND,
     UNSEEN,
@@ -27,9 +29,7 @@ from piccolo.localization.bundle import (
     judge_member,
     localize_bundle,
 )
-from piccolo.localization.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
-from piccolo.localization.judging import Found
-from piccolo.panorama import Panorama
+from piccolo.together.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
 from research.synthetic.world import mask_outside_field, photograph
 
 NEAR = np.array([2.0, -1.0, 0.5])

@@ -10,7 +10,7 @@ from test_pose import covariance
 
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add, subtract
-from piccolo.localization.bundle_adjustment import (
+from piccolo.together.bundle_adjustment import (
     LIKELY,
     Bundle,
     Estimate,

@@ -12,7 +12,7 @@ from piccolo.geometry.pose import Pose
 from piccolo.judge.belief import make_belief
 from piccolo.judge.localization import Alternative, FocalLength
 from piccolo.judge.pose_covariance import PoseCovariance
-from piccolo.walk.results import WalkFrame
+from piccolo.together.walk.results import WalkFrame
 
 SETTINGS = {"preset": "default", "cloud": {}, "panorama": {}}
 SKEW = Pose(np.diag([1.0, 1.0, 1.01]), np.zeros(3))

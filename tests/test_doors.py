@@ -24,9 +24,9 @@ from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama.texels import pack_texels
 from piccolo.photo import GpsPrior
 from piccolo.result import read_results
+from piccolo.together.walk.path import Gap
+from piccolo.together.walk.results import Alone, WalkFrame
 from piccolo.views.zbuffer import nearest_depth, render_view, visible_points
-from piccolo.walk.path import Gap
-from piccolo.walk.results import Alone, WalkFrame
 
 I = np.eye(3)  # noqa: E741
 HERE = np.zeros(3)

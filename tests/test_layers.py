@@ -30,7 +30,7 @@ LAYERS = [
     "scan_walk",
     "opened_scan",
     "result",
-    "walk",
+    "together",
     "localization",
     "paper",
     "evidence",

@@ -24,7 +24,7 @@ from piccolo.panorama import picture
 from piccolo.photo import Photo
 from piccolo.result import read_results
 from piccolo.scan_walk import Walk
-from piccolo.walk import tracker as tracker_module
+from piccolo.together.walk import tracker as tracker_module
 from research.synthetic.walk_frames import writing_video
 from research.synthetic.world import free_position, photograph
 

@@ -22,9 +22,9 @@ from piccolo.judge.localization import Alternative, Evidence, Localization
 from piccolo.judge.reasons import Reason
 from piccolo.photo import Photo
 from piccolo.problem.settings import CoarseToFineSettings
-from piccolo.walk.frames import MOST_ODDS, Frame, State, list_states
-from piccolo.walk.path import Ranked
-from piccolo.walk.results import check_odometry, make_localization, smooth_positions
+from piccolo.together.walk.frames import MOST_ODDS, Frame, State, list_states
+from piccolo.together.walk.path import Ranked
+from piccolo.together.walk.results import check_odometry, make_localization, smooth_positions
 
 MAX_ACCELERATION = 0.5  # [m/s^2]
 MAX_SPEED = 2.0  # [m/s]

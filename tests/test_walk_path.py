@@ -10,10 +10,10 @@ from refusals import assert_input_error
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, carry, exp_so3, pose_errors, yaw_rotation
-from piccolo.walk import path as walk_path, results
-from piccolo.walk.frames import JUMP_LOG, MOST_EXPECTED, Frame, Motion, State, check_times
-from piccolo.walk.path import NOTHING, Ranked, believe
-from piccolo.walk.tracker import Followed, expect
+from piccolo.together.walk import path as walk_path, results
+from piccolo.together.walk.frames import JUMP_LOG, MOST_EXPECTED, Frame, Motion, State, check_times
+from piccolo.together.walk.path import NOTHING, Ranked, believe
+from piccolo.together.walk.tracker import Followed, expect
 
 MOTION = Motion(max_speed=1.0)
 

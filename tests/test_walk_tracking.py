@@ -16,8 +16,8 @@ from piccolo.judge.selection import CHANCE_MATCHES
 from piccolo.localization import ladder, near
 from piccolo.localization.beam import score_briefly, score_mirror
 from piccolo.localization.near import Near
-from piccolo.walk import tracker
-from piccolo.walk.expectation import (
+from piccolo.together.walk import tracker
+from piccolo.together.walk.expectation import (
     Expected,
     Start,
     describe_end,
@@ -27,8 +27,8 @@ from piccolo.walk.expectation import (
     list_starts,
     predict,
 )
-from piccolo.walk.frames import Frame, Motion, State
-from piccolo.walk.tracker import choose_end, find_near, find_places, narrow_down, refine_state, track
+from piccolo.together.walk.frames import Frame, Motion, State
+from piccolo.together.walk.tracker import choose_end, find_near, find_places, narrow_down, refine_state, track
 
 SEED = 1
 EFFORT = rooms.AUTO.effort

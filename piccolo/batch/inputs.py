@@ -20,7 +20,7 @@ from ..panorama.cube import is_cube
 from ..panorama.photo import read_photo_facts
 from ..photo import Photo, Prior, Vector
 from ..scan_map.scan_map import ScanMap, check_within
-from ..walk.frames import check_times
+from ..together.walk.frames import check_times
 
 STDIN = "-"
 WANTED_LIST = "wanted a text file, a photo's path on each line"

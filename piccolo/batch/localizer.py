@@ -30,7 +30,6 @@ from ..judge.consensus import Consensus
 from ..judge.localization import FocalLength
 from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..judge.sure import SURE_CONFIDENCE
-from ..localization.beside import SurePhoto
 from ..localization.means import Step, Trace
 from ..opened_scan import OpenedScan, Settings, make_failed_result, settings_json
 from ..opening import open_files
@@ -39,6 +38,7 @@ from ..problem.settings import CoarseToFineSettings
 from ..result import Beside, Result, Source, localization_of, unreadable_result, with_localization
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
+from ..together.beside import SurePhoto
 from ..views.pictures import encode_image, overlay_png
 from .inputs import PriorTable
 

@@ -10,7 +10,7 @@ from ..arrays import Array
 from ..camera.foreign import is_reconstruction
 from ..files.json_file import naming, read_json
 from ..geometry.pose import OPENGL_FROM_CAM, OPTICAL_FROM_CAM, Pose, check_transform, exp_so3
-from ..localization.bundle_adjustment import RelativeScale
+from ..together.bundle_adjustment import RelativeScale
 
 SUFFIXES = (".json", ".sfm")
 NO_RIG = 0xFFFFFFFF  # Meshroom's number of a view that is of no rig

@@ -15,14 +15,14 @@ from ..arrays import Array
 from ..errors import InputError
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LOOSE, add, subtract
-from ..localization.bundle_adjustment import (
+from ..optimize.gauss_newton import Equations, minimize, sum_observations, whiten
+from ..together.bundle_adjustment import (
     RelativeErrors,
     choose_agreed,
     find_odd,
     match_median,
     robustly,
 )
-from ..optimize.gauss_newton import Equations, minimize, sum_observations, whiten
 
 LEAST_PHOTOS = 4
 NUM_ROUNDS = 5  # in which errors and the mount are estimated in turn

@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..files.json_file import naming, read_text
 from ..files.photo_names import match_names
 from ..geometry.pose import OPTICAL_FROM_CAM, Pose, check_transform, rotation_from_quaternion_wxyz
-from ..localization.bundle_adjustment import RelativeScale
+from ..together.bundle_adjustment import RelativeScale
 from .model_poses import SUFFIXES, NamedPose, read_json_poses
 
 WANTED = (

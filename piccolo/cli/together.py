@@ -33,7 +33,7 @@ from ..photo import Photo
 from ..result import FAILED, UNREADABLE, Result, read_results
 from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
-from ..walk.frames import Motion
+from ..together.walk.frames import Motion
 from . import terminal
 from .command import Arguments, UsageError
 from .execution import EXIT_SOME_NOT, Interruption, choose_exit_code, interruptible, print_result

@@ -22,7 +22,8 @@ from ..files.atomic import write_atomically, write_lines
 from ..files.json_file import naming, read_json
 from ..geometry.pose import Pose, log_so3
 from ..geometry.pose_gaussian import PoseGaussian, subtract
-from ..localization.bundle_adjustment import (
+from ..result import Result
+from ..together.bundle_adjustment import (
     UNKNOWN_SCALE,
     Bundle,
     Estimate,
@@ -32,8 +33,7 @@ from ..localization.bundle_adjustment import (
     find_odd,
     match_median,
 )
-from ..localization.bundle_search import move_origin_near
-from ..result import Result
+from ..together.bundle_search import move_origin_near
 from .colmap import read_model, write_model
 from .reconstructions import write_json
 

@@ -2,10 +2,10 @@
 
 Whatever helps a photo changes its `Belief` in one respect, or gives a pose with errors:
 - `localization.judging`: evidence of the photo alone gives `place`, its errors `within`, its camera `doubt`;
-- `localization.bundle`: `believe_together`, by photos whose relative poses are known;
-- `localization.beside`: `believe_beside`, by a photo that shows the same;
+- `together.bundle`: `believe_together`, by photos whose relative poses are known;
+- `together.beside`: `believe_beside`, by a photo that shows the same;
 - `localization.localize`: `share_place` among results with several focal lengths;
 - `judge.conclude`: `follow_consensus`, `doubt` by all photos of a camera (asked by `batch.localizer`);
-- `walk.results`: `place`, by the path of the camera.
-A new way adds its function to `judge.together`, and a job that calls it.
+- `together.walk`: `place`, by the path of the camera.
+A new way adds its function to `judge.by_others`, and a job that calls it.
 """

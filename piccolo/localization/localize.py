@@ -11,12 +11,12 @@ from ..geometry.pose import Pose
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.alternatives import MAX_ALTERNATIVES
 from ..judge.belief import NOTHING, make_belief
+from ..judge.by_others import share_place
 from ..judge.candidate import Candidate, Selection
 from ..judge.localization import Alternative, FocalLength, Localization
 from ..judge.probability import LOCALIZED
 from ..judge.reasons import Reason
 from ..judge.selection import is_faint, rank
-from ..judge.together import share_place
 from ..panorama import Panorama
 from ..panorama.edges import find_axes
 from ..photo import Prior

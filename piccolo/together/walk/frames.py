@@ -13,17 +13,17 @@ from typing import Literal
 
 import numpy as np
 
-from ..arguments import MAX_SPEED, MAX_STEP, check_fields
-from ..arrays import Array
-from ..errors import InputError
-from ..geometry.nearness import ONE_ANSWER
-from ..geometry.pose import Pose
-from ..geometry.pose_gaussian import PoseGaussian
-from ..judge.candidate import Candidate
-from ..judge.localization import Localization
-from ..judge.probability import LOCALIZED
-from ..scan_map.camera_positions import COARSE_SPACING
-from ..scan_map.scan_map import ScanMap
+from ...arguments import MAX_SPEED, MAX_STEP, check_fields
+from ...arrays import Array
+from ...errors import InputError
+from ...geometry.nearness import ONE_ANSWER
+from ...geometry.pose import Pose
+from ...geometry.pose_gaussian import PoseGaussian
+from ...judge.candidate import Candidate
+from ...judge.localization import Localization
+from ...judge.probability import LOCALIZED
+from ...scan_map.camera_positions import COARSE_SPACING
+from ...scan_map.scan_map import ScanMap
 
 How = Literal["alone", "near", "tracked", "none"]
 MOST_EXPECTED = 3.0  # [log] that a frame gains at most by being where it was to be expected

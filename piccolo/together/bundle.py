@@ -20,11 +20,15 @@ from ..evidence.focal_length import FocalFit
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_within, subtract
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
+from ..judge.by_others import Shares, believe_together
 from ..judge.candidate import Selection
 from ..judge.consensus import MOST_CONFLICT, Consensus
 from ..judge.localization import Localization
 from ..judge.probability import LOCALIZED
-from ..judge.together import Shares, believe_together
+from ..localization.calibration import calibrate
+from ..localization.judging import Found, judge, judge_together
+from ..localization.localize import explain_nothing, find, find_by_edges, prepare_search
+from ..localization.means import Means
 from ..panorama import Panorama
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
@@ -47,10 +51,6 @@ from .bundle_search import (
     propose_bundles,
     weigh_bundles,
 )
-from .calibration import calibrate
-from .judging import Found, judge, judge_together
-from .localize import explain_nothing, find, find_by_edges, prepare_search
-from .means import Means
 
 EVEN = 0.5
 LOCAL_ERRORS = np.diag(np.repeat([math.radians(2.0) ** 2, 0.15**2], 3))  # chosen: of local optima, [rad, m]

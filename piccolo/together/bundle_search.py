@@ -16,19 +16,19 @@ from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose, angle_between
 from ..geometry.pose_gaussian import PoseGaussian
 from ..jobs.threads import Workers
+from ..judge.by_others import LEAST_NONE
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Errors
 from ..judge.consensus import MOST_CONFLICT
 from ..judge.localization import Localization
 from ..judge.probability import CONTRADICTED, posterior
 from ..judge.selection import assess
-from ..judge.together import LEAST_NONE
+from ..localization.judging import Found
+from ..localization.ladder import refine
+from ..localization.last_descent import HOPELESS_SCORE
 from ..problem.problem import Problem
 from ..problem.stages import FINE
 from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
-from .judging import Found
-from .ladder import refine
-from .last_descent import HOPELESS_SCORE
 
 MISSED = 0.25  # chosen: of photos, those without a right pose found (of BENCHMARK.md's phone photos a sixth)
 MOST_UNSEEN = 1.0 / 3.0  # chosen: of photos, those that may show nothing

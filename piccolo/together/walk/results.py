@@ -13,21 +13,21 @@ from typing import Any
 
 import numpy as np
 
-from ..arguments import MIN_CONFIDENCE
-from ..arrays import Array
-from ..evidence.contradictions import contradictions
-from ..geometry.pose import Pose, carry
-from ..geometry.pose_gaussian import PoseGaussian, add, probability_within
-from ..jobs.threads import Progress, no_progress, one_blas_thread
-from ..judge.alternatives import MAX_ALTERNATIVES
-from ..judge.belief import make_belief
-from ..judge.conclude import take_pose
-from ..judge.consensus import MOST_CONFLICT
-from ..judge.localization import Alternative, Localization
-from ..judge.pose_covariance import describe_errors
-from ..judge.probability import LOCALIZED
-from ..judge.reasons import explain
-from ..problem.problem import Problem
+from ...arguments import MIN_CONFIDENCE
+from ...arrays import Array
+from ...evidence.contradictions import contradictions
+from ...geometry.pose import Pose, carry
+from ...geometry.pose_gaussian import PoseGaussian, add, probability_within
+from ...jobs.threads import Progress, no_progress, one_blas_thread
+from ...judge.alternatives import MAX_ALTERNATIVES
+from ...judge.belief import make_belief
+from ...judge.conclude import take_pose
+from ...judge.consensus import MOST_CONFLICT
+from ...judge.localization import Alternative, Localization
+from ...judge.pose_covariance import describe_errors
+from ...judge.probability import LOCALIZED
+from ...judge.reasons import explain
+from ...problem.problem import Problem
 from .expectation import Expected, Followed
 from .frames import Frame
 from .path import EVEN, Gap, Path, Ranked, believe, build_lattice

@@ -18,23 +18,23 @@ from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_within, turn_positions
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
+from ..judge.by_others import believe_beside
 from ..judge.conclude import take_pose
 from ..judge.localization import Localization
 from ..judge.pose_covariance import PoseCovariance
 from ..judge.selection import SURE_MATCHES
-from ..judge.together import believe_beside
 from ..local_features.hypotheses import exact_pose, propose_poses
 from ..local_features.matching import Matches
+from ..localization.attempts import add_verified
+from ..localization.judging import Found, judge
+from ..localization.last_descent import refine_best
+from ..localization.localize import fit_camera
+from ..localization.means import Means
 from ..panorama import Panorama
 from ..problem.prior import apply_prior
 from ..problem.problem import Problem, prepare_problem
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
-from .attempts import add_verified
-from .judging import Found, judge
-from .last_descent import refine_best
-from .localize import fit_camera
-from .means import Means
 
 MOST_BESIDE = 3  # photos whose matches count, those with the most
 

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..geometry.nearness import ONE_PLACE
-from ..geometry.pose import Pose, carry, exp_so3, log_so3
+from ...geometry.nearness import ONE_PLACE
+from ...geometry.pose import Pose, carry, exp_so3, log_so3
 from .frames import MOST_EXPECTED, Frame, How, Motion, State
 from .path import COPY_LOG_ODDS
 

@@ -7,26 +7,26 @@ from itertools import compress
 
 import numpy as np
 
-from ..evidence.examine import complete, examine
-from ..evidence.verification import draw_near, match_beside, place_keypoints, verify
-from ..geometry.nearness import ONE_ANSWER, ONE_PLACE, non_maximum_suppression
-from ..geometry.pose import Pose, uniform_yaws
-from ..jobs.threads import Stopwatch, Workers, one_blas_thread
-from ..judge.candidate import Selection
-from ..judge.probability import MODELS, Standing, pose_features, posterior
-from ..judge.selection import assess
-from ..judge.sure import SURE_ODDS
-from ..localization.attempts import can_look_first
-from ..localization.beam import Ends, descend_briefly, score_briefly, score_mirror, score_near
-from ..localization.localize import localize
-from ..localization.means import Means
-from ..localization.near import Near, refine_near
-from ..panorama import Panorama
-from ..problem.prior import apply_prior
-from ..problem.problem import Problem, prepare_problem
-from ..problem.settings import CoarseToFineSettings, Effort
-from ..scan_map.camera_positions import FreeSpace
-from ..scan_map.scan_map import ScanMap
+from ...evidence.examine import complete, examine
+from ...evidence.verification import draw_near, match_beside, place_keypoints, verify
+from ...geometry.nearness import ONE_ANSWER, ONE_PLACE, non_maximum_suppression
+from ...geometry.pose import Pose, uniform_yaws
+from ...jobs.threads import Stopwatch, Workers, one_blas_thread
+from ...judge.candidate import Selection
+from ...judge.probability import MODELS, Standing, pose_features, posterior
+from ...judge.selection import assess
+from ...judge.sure import SURE_ODDS
+from ...localization.attempts import can_look_first
+from ...localization.beam import Ends, descend_briefly, score_briefly, score_mirror, score_near
+from ...localization.localize import localize
+from ...localization.means import Means
+from ...localization.near import Near, refine_near
+from ...panorama import Panorama
+from ...problem.prior import apply_prior
+from ...problem.problem import Problem, prepare_problem
+from ...problem.settings import CoarseToFineSettings, Effort
+from ...scan_map.camera_positions import FreeSpace
+from ...scan_map.scan_map import ScanMap
 from .expectation import (
     Expected,
     Followed,

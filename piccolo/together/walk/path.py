@@ -17,10 +17,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Mask
-from ..geometry.nearness import ONE_ANSWER
-from ..geometry.pose import Pose, carry
-from ..scan_map.camera_positions import FreeSpace
+from ...arrays import Array, Mask
+from ...geometry.nearness import ONE_ANSWER
+from ...geometry.pose import Pose, carry
+from ...scan_map.camera_positions import FreeSpace
 from .frames import JUMP_LOG, MOST_EXPECTED, MOST_ODDS, REACH_SLACK, Frame, Motion, State, state_centers
 
 EVEN = 0.5  # less is not sure
