@@ -199,13 +199,13 @@ def test_constants_are_moved_one_at_a_time_and_put_back(scene, capsys, monkeypat
     moved = []
 
     def localize_once(scan_map, trial, workers):
-        moved.append((attempts.MIRROR_RATIO, attempts.NUM_MATCHED))
+        moved.append((attempts.FIRST_MIRROR_RATIO, attempts.NUM_MATCHED))
         if trial.case not in found:
             found[trial.case] = localize(scan_map, trial, workers)
         return found[trial.case]
 
     monkeypatch.setattr(sensitivity, "localize_trial", localize_once)
-    few = {"localization.attempts": ("MIRROR_RATIO", "NUM_MATCHED")}
+    few = {"localization.attempts": ("FIRST_MIRROR_RATIO", "NUM_MATCHED")}
     monkeypatch.setattr(sensitivity, "CONSTANTS", few)
     assert benchmark.main(["sensitivity", "--scenes", str(scene), "--most", "1", "--quiet"]) == 0
     head, _, before, *rows = capsys.readouterr().out.strip().splitlines()
@@ -216,7 +216,7 @@ def test_constants_are_moved_one_at_a_time_and_put_back(scene, capsys, monkeypat
     by_run = zip(moved[::2], moved[1::2], strict=True)  # a panorama, and a photo
     expected = [(1.1, 6), (0.88, 6), (1.32, 6), (1.1, 5), (1.1, 7)]
     assert [run for run, again in by_run if run == again] == [pytest.approx(pair) for pair in expected]
-    assert (attempts.MIRROR_RATIO, attempts.NUM_MATCHED) == (1.1, 6)
+    assert (attempts.FIRST_MIRROR_RATIO, attempts.NUM_MATCHED) == (1.1, 6)
 
 
 def test_every_constant_that_is_moved_decides_outside_of_kernels():

@@ -31,7 +31,7 @@ from .beam import refine_matches, refine_starts, score_mirror, score_starts
 from .means import Means
 from .search import Tilts, search_poses
 
-MIRROR_RATIO = 1.1  # least ratio of first scores, photo to mirrored photo
+FIRST_MIRROR_RATIO = 1.1  # least ratio of first scores, photo to mirrored photo
 FIRST_BEAM = Beam(100, 12, 4, 1)
 FIRST_ROTATIONS = 1000  # of SO(3)
 FEW_CELLS = 200  # of the grid; if a prior leaves fewer, all of them are searched
@@ -97,7 +97,7 @@ def look_first(problem: Problem, known: list[Candidate], means: Means) -> tuple[
 
 def beats_mirror(own: float, mirrored: float) -> bool:
     """Return True if first scores tell a photo from its mirror image."""
-    return own >= MIRROR_RATIO * mirrored
+    return own >= FIRST_MIRROR_RATIO * mirrored
 
 
 def draw_found(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:

@@ -53,7 +53,7 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
         "SURE_MATCHES",
         "SURE_ODDS",
     ),
-    "localization.attempts": ("ENOUGH_MATCHES", "MIRROR_RATIO", "NUM_MATCHED"),
+    "localization.attempts": ("ENOUGH_MATCHES", "FIRST_MIRROR_RATIO", "NUM_MATCHED"),
     "localization.beam": ("FAINT_PART", "NUM_FOUND", "NUM_SCORED"),
     "localization.calibration": ("CLEARLY",),
     "localization.judging": ("WORTH_ASKING",),
