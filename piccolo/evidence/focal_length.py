@@ -127,13 +127,12 @@ class FocalFit(NamedTuple):
 def doubt_unconfirmed(fit: FocalFit, gaussian: PoseGaussian | None) -> FocalFit:
     """Return the fit of a photo by itself, doubted more where the photo does not confirm what was given.
 
-    If what was given says nothing, the pose is only as exact as by the photo's own focal length. Both doubts
-    are about the same wrong claims: the greater one counts.
+    If what was given says nothing, the pose is only as exact as by the photo's own focal length.
     """
     if fit.of_picture is None or gaussian is None:
         return fit
     missed = 1.0 - probability_within(gaussian.widen(fit.of_picture))
-    return fit._replace(doubt=max(fit.doubt, UNCONFIRMED * missed))
+    return fit._replace(doubt=1.0 - (1.0 - fit.doubt) * (1.0 - UNCONFIRMED * missed))
 
 
 def fit_focal(problem: Problem, best: Candidate, workers: Workers, is_first: bool = True) -> FocalFit:
