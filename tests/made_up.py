@@ -78,7 +78,8 @@ def exact_matches(pose, count, num_wrong=0, seed=0):
     tangents = np.cross(directions, rng.normal(size=(count, 3)))
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     angles = rng.uniform(0.02, 0.2, count)
-    rays, ray_tangents = directions @ pose.R_cam_from_world.T, tangents @ pose.R_cam_from_world.T
+    rays = directions @ pose.R_cam_from_world.T
+    ray_tangents = tangents @ pose.R_cam_from_world.T
     wrong = slice(count - num_wrong, count)
     points[wrong] = rng.uniform(-3, 3, (num_wrong, 3))
     values = rays, ray_tangents, angles, points, directions, tangents, angles * ranges

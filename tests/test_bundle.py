@@ -102,7 +102,8 @@ def test_sure_photos_elsewhere_speak_against_the_relative_poses():
 def test_a_certain_place_counts_whole_however_inexact_the_pose_is(std):
     """How exact it is counts once, in the end."""
     problem = replace(PROBLEM, scan_map=SimpleNamespace(sparse=range(100)))
-    best, other = make_candidate(0.0, 0.6, 80), make_candidate(3.0, 0.02)
+    best = make_candidate(0.0, 0.6, 80)
+    other = make_candidate(3.0, 0.02)
     belief = make_belief([0.99, 0.001], within=0.5)
     gaussian = PoseGaussian(best.pose, np.diag([1e-6] * 3 + [std**2] * 3), np.zeros((6, 6)))
     alone = Localization(

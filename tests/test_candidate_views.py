@@ -134,7 +134,8 @@ def test_poses_near_one_place_share_what_is_drawn_and_no_others():
 
 
 def test_views_and_points_count_from_their_place():
-    problem, pose = _problem(), _pose(0.307, 0.191, 0.304)
+    problem = _problem()
+    pose = _pose(0.307, 0.191, 0.304)
     place = points_around.round_position(pose)
     expected = rooms.view(problem.scan_map.octree, place, FINE, FINE_CELLS)
     points = visible_points(problem.scan_map.octree, place, FULL, FINE_CELLS.tobytes(), EVERYWHERE, 30_000)
@@ -153,7 +154,8 @@ def test_views_and_points_count_from_their_place():
 
 @pytest.mark.parametrize("shift", [0.0, 0.008])
 def test_points_depend_on_what_the_photo_shows(shift):
-    problem, pose = _problem(), _pose(0.3 + shift, 0.2, 0.3)
+    problem = _problem()
+    pose = _pose(0.3 + shift, 0.2, 0.3)
     height, width = problem.photo.panorama.is_valid.shape
     half = problem.show(problem.photo.mask(np.arange(width)[None] < np.full((height, 1), width // 2)))
     assert half.views is problem.views

@@ -294,7 +294,8 @@ def test_a_wrong_unit_is_told_before_the_long_work_begins(tmp_path, preset):
     path = tmp_path / "mm.xyz"
     raw = seeded_cloud(1, 1500, size=(6000.0, 5000.0, 2500.0))
     np.savetxt(path, np.hstack([raw.points_world, raw.colors]), fmt="%.3f")
-    no_cache, workers = CachePolicy(is_used=False), Workers(1, show, warn)
+    no_cache = CachePolicy(is_used=False)
+    workers = Workers(1, show, warn)
     with pytest.raises(InterruptedError):
         open_files([path], CloudSettings(), preset, no_cache, workers)
     (warning,) = heard

@@ -103,7 +103,8 @@ def _judged(belief, **focal):
 
 def test_a_consensus_changes_the_doubt_alone_and_rules_out():
     belief = make_belief([0.97], within=0.98, doubt=0.02)
-    confirming, contradicting = Opinion(0.0, 0.002**2), Opinion(0.05, 0.002**2)
+    confirming = Opinion(0.0, 0.002**2)
+    contradicting = Opinion(0.05, 0.002**2)
     found = follow_consensus(_judged(belief), confirming, 0.9)
     assert found.belief == replace(belief, doubt=found.focal_length.doubt)
     assert found.belief.doubt < 0.01

@@ -195,7 +195,8 @@ def test_points_are_taken_again_from_where_the_pose_is_until_it_hardly_moves(set
 
 def test_cells_and_points_are_those_that_the_photo_shows():
     """Cells around the camera that point where the photo has a picture; all, for a photo of a sphere."""
-    whole, pose = _problem(1), at(0.0, 0.0, 70.0).pose
+    whole = _problem(1)
+    pose = at(0.0, 0.0, 70.0).pose
     is_hidden = ~(np.abs(np.arange(16) - 4) < 2) & np.ones((8, 1), bool)  # but a fifth, around the left
     narrow = whole.show(whole.photo.mask(is_hidden))
     grid = make_grid(VIEWS["points"].num_rings)
@@ -218,7 +219,8 @@ def test_cells_and_points_are_those_that_the_photo_shows():
 @pytest.mark.parametrize(("seed", "most"), [(1, 5e-5), (3, 5e-4), (4, 5e-5)])
 def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
     """Starts 5 mm apart end within 0.05 mm where the loss has one minimum; in noise it has several."""
-    problem, true_pose = _problem(seed), rooms.scene(seed)[2]
+    problem = _problem(seed)
+    true_pose = rooms.scene(seed)[2]
     ends = [
         ladder.settle(problem, examine(problem, step(true_pose, np.array([0, 0, 0, *d]))), ALONE).pose
         for d in ([0.002, 0.001, 0.0], [-0.002, -0.001, 0.002])
@@ -240,7 +242,8 @@ def _fine():
 
 
 def test_descent_finds_the_true_pose_again():
-    (cells, true_pose), image = _fine(), _problem(1).photo.images.fine()
+    (cells, true_pose) = _fine()
+    image = _problem(1).photo.images.fine()
     off = step(true_pose, np.array([0.03, -0.02, 0.04, 0.06, -0.05, 0.04]))
     pose = ladder.descend(cells, image, off, Limits(1.0, 30, 1e-5))
     assert rooms.errors(pose, true_pose)[0] < 0.01
@@ -250,7 +253,8 @@ def test_descent_finds_the_true_pose_again():
 
 
 def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
-    (_, true_pose), images = _fine(), _problem(1).photo.images
+    (_, true_pose) = _fine()
+    images = _problem(1).photo.images
     off = step(true_pose, ladder.perturbations(1.0)[1])
     assert rooms.errors(off, true_pose)[0] > 0.2
     cells = rooms.view(rooms.scan_map(1).octree, off.center_world, VIEWS["fine"], ALL)
@@ -263,7 +267,9 @@ def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
 
 
 def test_starts_descend_on_their_candidates_views_as_one_does_alone():
-    scan_map, (_, true_pose), image = rooms.scan_map(1), _fine(), _problem(1).photo.images.search()
+    scan_map = rooms.scan_map(1)
+    (_, true_pose) = _fine()
+    image = _problem(1).photo.images.search()
     distance = np.linalg.norm(scan_map.centers - true_pose.center_world, axis=1)
     k, far = int(np.argmin(distance)), int(np.argmax(distance))
     candidate, R = np.array([k, far, k]), true_pose.R_cam_from_world
