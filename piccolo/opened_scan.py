@@ -21,7 +21,7 @@ from .jobs.threads import Stopwatch, Workers
 from .judge.localization import FocalLength, Localization
 from .judge.probability import LOCALIZED, NOT_LOCALIZED
 from .localization.localize import has_guessed_focal, localize, localize_guessed
-from .localization.means import NO_TRACE, Trace
+from .localization.means import NO_TRACE, Means, Trace
 from .localization.places import add_places
 from .panorama import Panorama, check_labels, read_panorama
 from .panorama.photo import PhotoFacts, read_photo_facts, sha256_of
@@ -88,13 +88,14 @@ class OpenedScan:
             assert isinstance(settings, CoarseToFineSettings)
             gps = self.make_gps_prior(facts, settings.prior)
             run = localize_guessed if has_guessed_focal(picture) else localize
+            means = Means(settings.effort, self.workers, watch, trace)
             found = Localization()
             if gps is not None:
                 near = replace(settings, prior=gps.apply_to(settings.prior))
-                found = run(self.prepared, picture, near, self.workers, watch, trace)
+                found = run(self.prepared, picture, near, means)
             if found.status != LOCALIZED:
                 gps = gps and replace(gps, is_used=False)
-                found = run(self.prepared, picture, settings, self.workers, watch, trace)
+                found = run(self.prepared, picture, settings, means)
         if focal is not None:
             found = replace(found, focal_length=focal.update(found.focal_length))
         blank = self.make_blank(photo, picture, facts, settings, watch.seconds)

@@ -136,7 +136,7 @@ def listen():
 
 def locate(panorama, scan_map, settings=AUTO, num_threads=2):
     """A panorama localized in a map."""
-    return localize(scan_map, panorama, settings, Workers(num_threads), Stopwatch())
+    return localize(scan_map, panorama, settings, means(settings, Workers(num_threads)))
 
 
 def errors(pose, true_pose):

@@ -18,7 +18,7 @@ from piccolo.evidence.examine import examine
 from piccolo.evidence.lens_matches import fit_matches
 from piccolo.evidence.self_calibration import Estimate
 from piccolo.geometry.pose import Pose, yaw_rotation
-from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import Selection
 from piccolo.judge.localization import Alternative, Evidence, FocalLength, Localization
@@ -26,7 +26,6 @@ from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import localize as module
 from piccolo.localization.calibration import follow_matches, recalibrate
 from piccolo.localization.localize import select_likeliest
-from piccolo.localization.means import Trace
 from piccolo.panorama import read_panorama
 from piccolo.photo import Photo
 from research.synthetic.world import render_picture
@@ -222,9 +221,9 @@ def test_the_first_sure_guess_ends_the_search(is_blank):
     rgb, _ = _photo(pinhole(320, 240, TRUE))
     panorama = _panorama(np.full_like(rgb, 128) if is_blank else rgb, focal_px=TRUE, refine_focal=True)
     scan_map = rooms.scan_map(SEED, DENSE)
-    trace = Trace(is_wanted=True)
-    found = module.localize_guessed(scan_map, panorama, rooms.KNOWN, rooms.WORKERS, Stopwatch(), trace)
-    num_searched = [made["step"] for made in trace.steps].count("refined")
+    means = rooms.means(rooms.KNOWN)
+    found = module.localize_guessed(scan_map, panorama, rooms.KNOWN, means)
+    num_searched = [made["step"] for made in means.trace.steps].count("refined")
     assert (found.status, num_searched) == (("not_localized", 3) if is_blank else ("localized", 1))
 
 

@@ -53,7 +53,7 @@ def of_two_rooms():
 def _localized(scan_map, seed, prior=None):
     settings = CoarseToFineSettings(gravity="known", prior=prior or Prior())
     panorama = rooms.as_panorama(rooms.query(seed).rgb)
-    return add_places(scan_map, localize(scan_map, panorama, settings, WORKERS, Stopwatch()))
+    return add_places(scan_map, localize(scan_map, panorama, settings, rooms.means(settings, WORKERS)))
 
 
 def _rows(scan_map, centers):

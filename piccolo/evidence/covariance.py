@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Int64s, Mask
-from ..evidence.contradictions import contradictions
 from ..geometry.pose import Pose, log_so3, rotate_points, step, yaw_rotation
 from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
 from ..geometry.sphere import compute_indices, find_cell, make_grid
@@ -27,6 +26,7 @@ from ..problem.profile import Profile
 from ..problem.stages import LAST, ImageName
 from ..views.view import Cells
 from .comparison import mask_occluders
+from .contradictions import contradictions
 from .scan_errors import layer_covariance, scan_covariance
 from .verification import draw_near, place_by_matches
 
@@ -44,9 +44,8 @@ ALONE = 0.05  # chosen: of the variance by edges, the part that is not in common
 SCALE = LAST.limits.loss_scale * LEVELS_PER_UNIT
 # normals (9, 3), in the camera's frame, of planes between halves: the seam of two lenses may have any azimuth
 NORMALS = np.array([*(yaw_rotation(k * math.pi / 8.0)[0] for k in range(8)), (0.0, 0.0, 1.0)])
-MOST_SCORE = (
-    3.0  # of `score_halves`, by chance 1 in the mean; the best of nine planes has more in a quarter of photos
-)
+# of `score_halves`, by chance 1 in the mean; the best of nine planes has more in a quarter of photos
+MOST_SCORE = 3.0
 SEAMS = (0.25, 0.5, 0.75)  # of the points, on one side of a plane between parts of the scan
 SEAM_SCORE = 4.5  # of parts; single scans have more in a fifth of photos
 NUM_TRIED = 2  # planes

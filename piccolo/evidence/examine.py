@@ -4,15 +4,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
-from ..evidence.contradictions import contradictions
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..jobs.threads import Workers
-from ..judge.candidate import Candidate, Selection
+from ..judge.candidate import NO_CANDIDATE, Candidate, Selection
 from ..judge.selection import list_drawn, rank, select
 from ..problem.problem import Problem
 from ..problem.profile import DRAWN_VIEW
 from .comparison import compare
+from .contradictions import contradictions
 from .verification import draw_near, verify
 
 DRAWN_CHANCE = 0.2  # correlation of a block's drawn edges that wrong poses reach: these are sharper
@@ -65,6 +65,8 @@ def complete(problem: Problem, found: Selection, workers: Workers) -> Selection:
         drawn = compare(problem, candidate.pose, DRAWN_VIEW)
         return replace(candidate, edge_score=drawn.score_beyond(DRAWN_CHANCE))
 
+    if found.best is NO_CANDIDATE:
+        return found
     if problem.profile.has_shape:
         return found.take([fill_edges(candidate) for candidate in found.candidates])
     if not problem.profile.uses_matches:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from ..evidence.contradictions import contradictions
 from ..jobs.threads import Workers
 from ..judge.candidate import Selection
 from ..judge.case import Geometry, Measured
@@ -17,6 +16,7 @@ from ..judge.selection import count_matches
 from ..optimize.sampling_loss import sampling_loss
 from ..problem.problem import Problem
 from ..views.zbuffer import visible_points
+from .contradictions import contradictions
 from .covariance import estimate_errors
 from .focal_length import FocalFit
 from .occlusion import compare_occlusion, measure_agreement

@@ -21,10 +21,9 @@ def refine_best(problem: Problem, candidates: Sequence[Candidate], workers: Work
 
     If all are faint, only the best is refined first, on fine cells; if it stays faint, refinement ends.
     """
-    found = rank(candidates)
+    found = complete(problem, rank(candidates), workers)
     if found.best.score < HOPELESS_SCORE:
         return found
-    found = complete(problem, found, workers)
     if is_faint(problem.profile, found):
         best = climb_unoccluded(problem, found.best, workers)
         found = choose_among(problem, [best, *found.alternatives], workers)

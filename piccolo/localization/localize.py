@@ -8,7 +8,7 @@ from functools import partial
 from ..evidence.focal_length import WIDE
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
-from ..jobs.threads import Stopwatch, Workers, one_blas_thread
+from ..jobs.threads import Stopwatch, one_blas_thread
 from ..judge.alternatives import MAX_ALTERNATIVES
 from ..judge.belief import NOTHING, make_belief
 from ..judge.by_others import share_place
@@ -28,37 +28,28 @@ from .attempts import Attempt, plan_attempts, search_beyond_prior
 from .calibration import calibrate, calibrate_sphere
 from .judging import Found, judge
 from .last_descent import refine_best
-from .means import NO_TRACE, Means, Step, Trace, describe_candidates, describe_selection
+from .means import Means, Step, describe_candidates, describe_selection
 from .shape import align_level, find_tilts, is_explained, is_tilt_known
 
-GUESSES = (
-    0.0,
-    -0.15,
-    0.15,
-)  # added to the log of the focal length: one comes near enough to any that is 20 % off
+# added to the log of the focal length: one comes near enough to any that is 20 % off
+GUESSES = (0.0, -0.15, 0.15)
 MOST_RANGE = 10.0  # [m] of what is seen: a pose moves by this times the change of the focal length's log
 NO_PIXEL = "the panorama: no pixel counts, all are masked"
 
 
 @one_blas_thread()
 def localize(
-    scan_map: ScanMap,
-    panorama: Panorama,
-    settings: CoarseToFineSettings,
-    workers: Workers,
-    watch: Stopwatch,
-    trace: Trace = NO_TRACE,
+    scan_map: ScanMap, panorama: Panorama, settings: CoarseToFineSettings, means: Means
 ) -> Localization:
     """Localize a panorama: search until one attempt is sure, refine the best poses, judge the best one."""
-    means = Means(settings.effort, workers, watch, trace)
-    problem = prepare_search(scan_map, panorama, settings, watch)
+    problem = prepare_search(scan_map, panorama, settings, means.watch)
     if problem is None:
         return explain_nothing(scan_map, panorama, settings.prior)
-    with watch.stage("search"):
+    with means.watch.stage("search"):
         problem.photo.images.search()  # each search begins with it
     search = find_by_edges if problem.profile.has_shape else find
     found = search(problem, scan_map, means)
-    with watch.stage("refine"):
+    with means.watch.stage("refine"):
         return judge(found, means, settings.min_confidence)
 
 
@@ -165,12 +156,7 @@ def has_guessed_focal(panorama: Panorama) -> bool:
 
 
 def localize_guessed(
-    scan_map: ScanMap,
-    panorama: Panorama,
-    settings: CoarseToFineSettings,
-    workers: Workers,
-    watch: Stopwatch,
-    trace: Trace = NO_TRACE,
+    scan_map: ScanMap, panorama: Panorama, settings: CoarseToFineSettings, means: Means
 ) -> Localization:
     """Localize a photo with several focal lengths around a guess, until one result is sure."""
     camera = panorama.cameras[0].camera
@@ -178,7 +164,7 @@ def localize_guessed(
     found: list[Localization] = []
     for guess in GUESSES:
         photo = panorama.resample(camera.change(guess), width)
-        found.append(localize(scan_map, photo, settings, workers, watch, trace))
+        found.append(localize(scan_map, photo, settings, means))
         if found[-1].status == LOCALIZED:
             break
     return select_likeliest(found, settings)

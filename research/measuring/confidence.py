@@ -17,6 +17,7 @@ from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Stopwatch, Workers, num_cores
 from piccolo.judge.localization import Localization
 from piccolo.localization.localize import localize
+from piccolo.localization.means import Means
 from piccolo.panorama import read_panorama
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
 
@@ -220,7 +221,7 @@ def localize_trial(scan_map: ScanMap, trial: Trial, workers: Workers) -> Localiz
     """Localize the photo of a trial."""
     settings = CoarseToFineSettings(gravity=trial.gravity)
     photo = Photo(trial.rgb, focal_px=trial.focal_px, camera=trial.calibration, mask=trial.is_masked)
-    return localize(scan_map, read_panorama(photo), settings, workers, Stopwatch())
+    return localize(scan_map, read_panorama(photo), settings, Means(settings.effort, workers, Stopwatch()))
 
 
 def trial_line(scene: str, trial: Trial, found: Localization) -> dict[str, object]:

@@ -188,7 +188,7 @@ class Tracker:
 
     def _search(self, problem: Problem, panorama: Panorama, frame: Frame) -> None:
         """Search the whole scan for a frame, which is then a key frame."""
-        frame.alone = localize(self.scan_map, panorama, self.settings, self.workers, Stopwatch())
+        frame.alone = localize(self.scan_map, panorama, self.settings, self.means)
         is_sure = frame.is_localized_alone
         is_mirrored = not is_sure and can_look_first(problem) and fits_mirror(problem, self.means)
         if found := [] if is_mirrored else list_states(self.scan_map, frame.alone):
