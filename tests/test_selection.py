@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import rooms
-from made_up import PROBLEM, WHOLE, make_candidate, make_selection, place, places
+from made_up import PARTIAL, PROBLEM, WHOLE, make_candidate, make_selection, place, places
 
 from piccolo.evidence.examine import count_agreeing, examine
 from piccolo.geometry.pose import step
@@ -14,7 +14,7 @@ from piccolo.jobs.threads import Workers
 from piccolo.judge.candidate import Selection
 from piccolo.judge.localization import Localization
 from piccolo.judge.probability import Standing
-from piccolo.judge.selection import assess, credit_copies, select
+from piccolo.judge.selection import assess, credit_copies, list_drawn, select
 from piccolo.localization import last_descent
 from piccolo.localization.attempts import end_search
 from piccolo.localization.beam import refine_matches
@@ -245,3 +245,13 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere():
     assert (alone.evidence.margin, alone.evidence.alternative_matches) == (1.0, 0)
     nothing = pack_texels(panorama.rgb, np.zeros_like(panorama.is_valid))
     assert judged(best, asked=replace(problem, colors=lambda: nothing)) == Localization()  # no point is seen
+
+
+@pytest.mark.parametrize(("count", "expected"), [(12, 2), (11, 6)])
+def test_a_pose_that_explains_less_than_half_of_a_sure_one_is_not_drawn(count, expected):
+    """Of a whole photo, the scan is drawn at four others at most."""
+    scores = (0.8, 0.5, 0.4, 0.39, 0.3, 0.2, 0.1)
+    ranked = [make_candidate(k, score, count) for k, score in enumerate(scores)]
+    assert list_drawn(PARTIAL, ranked) == [k <= expected for k in range(7)]
+    assert list_drawn(WHOLE, ranked) == [k <= min(expected, 4) for k in range(7)]
+    assert list_drawn(PARTIAL.by_views(), ranked) == [False] * 7
