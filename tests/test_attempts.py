@@ -13,13 +13,14 @@ from piccolo.evidence.examine import examine
 from piccolo.evidence.verification import round_pose
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import Pose, exp_so3, step
-from piccolo.jobs.threads import Once, Stopwatch, Workers
+from piccolo.jobs.threads import Once, Workers
 from piccolo.judge.candidate import Drawn
 from piccolo.judge.probability import LOCALIZED
 from piccolo.judge.selection import is_clear
 from piccolo.local_features.keypoints import join_keypoints
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import attempts, beam, localize as method
+from piccolo.localization.means import NO_TRACE
 from piccolo.localization.search import search_poses
 from piccolo.panorama import GPano, Panorama
 from piccolo.photo import Prior
@@ -33,7 +34,9 @@ NO_FEATURES = Once(lambda workers: Features(join_keypoints([]), NO_MATCHES))
 
 
 def _localized(panorama, settings=rooms.KNOWN, scan_map=None):
-    return method.localize(scan_map or rooms.scan_map(1), panorama, settings, Workers(1), Stopwatch())
+    return method.localize(
+        scan_map or rooms.scan_map(1), panorama, settings, rooms.means(settings, Workers(1))
+    )
 
 
 def _problem(panorama, settings=rooms.KNOWN):
@@ -215,7 +218,7 @@ def test_attempts_are_made_until_one_is_sure(sure, num_made):
         return [*known, make_candidate(num, 0.5)], num == sure
 
     planned = [(replace(PROBLEM, features=PROBLEM.features[:k]), run) for k in (1, 2, 0)]
-    asked, found = method.make_attempts(planned, rooms.means()._replace(trace=method.NO_TRACE))
+    asked, found = method.make_attempts(planned, rooms.means()._replace(trace=NO_TRACE))
     assert places(found) == [1, 2, 0][:num_made]
     assert len(asked.features) == places(found)[-1]
 

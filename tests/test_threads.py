@@ -12,7 +12,7 @@ import rooms
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from piccolo.jobs import threads
-from piccolo.jobs.threads import Once, Stopwatch, Workers, one_blas_thread
+from piccolo.jobs.threads import Once, Workers, one_blas_thread
 from piccolo.localization import localize as method
 from piccolo.problem.settings import CoarseToFineSettings
 
@@ -225,6 +225,6 @@ def test_a_photo_is_localized_with_one(three_threads):
         yield from values
 
     settings = CoarseToFineSettings(gravity="known")
-    method.localize(rooms.scan_map(1), rooms.scene(1)[1], settings, Workers(2, show), Stopwatch())
+    method.localize(rooms.scan_map(1), rooms.scene(1)[1], settings, rooms.means(settings, Workers(2, show)))
     assert {("search", 1), ("evaluate", 1)} <= seen
     assert all(counts == [1] for _, *counts in seen)
