@@ -26,9 +26,10 @@ def keep(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def service(scene, keep):
+def service(scene, keep, photo):
     words = ["--cache", keep.parent / "maps", "--jobs", "1", "--keep", keep]
     with serving("--cloud", scene / "cloud.ply", *words) as client:
+        _assert_works(client, keep, photo)  # a process keeps the limits that it begins with
         yield client
     assert "Traceback" not in client.rest
     assert client.rest.count("could not be answered") == LINES
