@@ -136,21 +136,27 @@ def find_copies(problem: Problem, pose: Pose, others: Sequence[Pose], workers: W
     return workers.map(is_copy, others, "compare places")
 
 
-def place_keypoints(problem: Problem, pose: Pose, workers: Workers) -> Located:
-    """Give the keypoints of a photo that was taken at a pose in the map their ranges, from the scan.
+def find_ranges(problem: Problem, pose: Pose, workers: Workers) -> Array32:
+    """Return the ranges (N,) [m] of a photo's keypoints, from the scan, if it was taken at a pose in the map.
 
-    Those on what the scan does not show, as people and furniture that has moved, are left out.
+    Those on what the scan does not show, as people and furniture that has moved, have 0.
     """
     views, keypoints = problem.photo.seen(workers)
     panorama = problem.photo.panorama
     mask = occlusion_mask(problem.surroundings_at(pose)[0], panorama, pose)
-    keypoints = keypoints.take(mask[compute_indices(keypoints.rays, mask.shape[1])] == EXPLAINED)
     ranges = np.zeros(len(keypoints.rays), np.float32)
     for view in views:
         shown = view.find_own(keypoints.rays)
         ranges[shown] = draw(problem, pose, view)[0].ranges[view.project(keypoints.rays[shown])]
+    is_explained = mask[compute_indices(keypoints.rays, mask.shape[1])] == EXPLAINED
+    return np.where(is_explained, ranges, np.float32(0.0))
+
+
+def place_keypoints(problem: Problem, pose: Pose, workers: Workers) -> Located:
+    """Return the keypoints of a photo that was taken at a pose in the map, those that have ranges there."""
+    ranges = find_ranges(problem, pose, workers)
     is_seen = np.flatnonzero(ranges > 0.0)
-    return Located(keypoints.take(is_seen), ranges[is_seen], pose)
+    return Located(problem.photo.seen(workers).keypoints.take(is_seen), ranges[is_seen], pose)
 
 
 def match_beside(problem: Problem, other: Located, workers: Workers) -> Matches:

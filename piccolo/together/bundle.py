@@ -140,7 +140,7 @@ def judge_members(
     for k, member in members.items():
         problem = member.found.problem.forget()
         for bundle, supports in zip(bundles, tested, strict=True):
-            supports[k] = find_support(member, problem, bundle, workers)
+            supports[k] = find_support(member, problem, bundle.place(member.cam_from_bundle), workers)
     probabilities = weigh_bundles([list(supports.values()) for supports in tested], list(members.values()))
     best = int(probabilities[:-1].argmax()) if bundles else 0
     if not bundles or probabilities[best] < EVEN:
@@ -153,7 +153,11 @@ def judge_members(
         near = agreed.adjusted.bundle
         supports |= {
             k: find_support(
-                members[k], members[k].found.problem.forget(), near, workers, list_neighbors(members, k)
+                members[k],
+                members[k].found.problem.forget(),
+                near.place(members[k].cam_from_bundle),
+                workers,
+                [near.place(cam) for cam in list_neighbors(members, k)],
             )
             for k, support in supports.items()
             if not support.is_found
@@ -255,30 +259,36 @@ def refuse(member: Member, reason: str) -> Localization:
     return Localization(warnings=(*member.alone.warnings, reason))
 
 
-class Placed(NamedTuple):
-    """The pose of a photo in a bundle."""
+class Placement(NamedTuple):
+    """The pose of a photo among others."""
 
     gaussian: PoseGaussian | None  # in the map; None if neither the photo nor others tell it
     shares: Shares
     within_others: float  # probability that it is within 0.1 m if the pose that the others expect is right
 
 
-def place_member(member: Member, number: int, shares: Shares, agreed: Agreed) -> Placed:
-    """Return the mean of a photo's own pose and the one that the others expect, or the likelier of them."""
+def place_member(member: Member, number: int, shares: Shares, agreed: Agreed) -> Placement:
+    """Place a photo by its own pose, and by where the others expect it."""
     rest = [estimate for k, estimate in agreed.estimates.items() if k != number]
     estimate = agreed.estimates.get(number)
-    own = None if estimate is None else estimate.own
-    if not rest:
-        return Placed(own, shares, 0.0)
-    adjusted = adjust(agreed.adjusted.bundle, rest, agreed.errors)
-    expected = adjusted.predict(member.cam_from_bundle, agreed.errors)
+    expected = None
+    if rest:
+        adjusted = adjust(agreed.adjusted.bundle, rest, agreed.errors)
+        expected = adjusted.predict(member.cam_from_bundle, agreed.errors)
+    return place_between(shares, None if estimate is None else estimate.own, expected)
+
+
+def place_between(shares: Shares, own: PoseGaussian | None, expected: PoseGaussian | None) -> Placement:
+    """Return the mean of a photo's own pose and the one that others expect, or the likelier of them."""
+    if expected is None:
+        return Placement(own, shares, 0.0)
     gaussian = expected
     if own is not None:
         shares = shares.weigh_own(compare_errors(expected, own))
         if shares.right >= shares.missed:
             gaussian = expected.fuse(own)
     offset = gaussian.pose.center_world - expected.pose.center_world
-    return Placed(gaussian, shares, probability_near(offset, expected.covariance[3:, 3:]))
+    return Placement(gaussian, shares, probability_near(offset, expected.covariance[3:, 3:]))
 
 
 def judge_member(
@@ -300,18 +310,40 @@ def judge_member(
     belongs = Shares(*support.shares[:2].tolist())
     if belongs.here < EVEN or number in agreed.apart:
         return judge_apart(member, CONTRADICTS)
-    gaussian, shares, within_others = place_member(member, number, belongs, agreed)
-    if gaussian is None:
+    placed = place_member(member, number, belongs, agreed)
+    if placed.gaussian is None:
         return refuse(member, NOT_FOUND)
+    places = [bundle.place(member.cam_from_bundle) for bundle in elsewhere]
+    is_agreed = number in agreed.estimates
+    result = judge_placed(member, support, placed, is_agreed, places, probabilities, means, min_confidence)
+    doubts = (UNSEEN,) if placed.shares.right < EVEN else ()
+    return replace(result, warnings=result.warnings + doubts + agreed.warnings)
+
+
+def judge_placed(
+    member: Member,
+    support: Support,
+    placed: Placement,
+    is_agreed: bool,
+    elsewhere: Sequence[Pose],
+    probabilities: Array,
+    means: Means,
+    min_confidence: float,
+) -> Localization:
+    """Return the result of a photo that is placed by itself and by others.
+
+    `is_agreed` if its own pose agrees with theirs. `elsewhere` are the poses that the photo has if the photos
+    together are at other places; `probabilities` (K + 1,) are of all of these places, and of none.
+    """
+    gaussian, shares, within_others = placed
+    assert gaussian is not None
     within = probability_within(gaussian)
     alone = None
-    if member.alone.status == LOCALIZED and number in agreed.estimates and member.alone.gaussian:
+    if member.alone.status == LOCALIZED and is_agreed and member.alone.gaussian:
         alone = replace(member.alone.belief, within=min(within, member.alone.belief.within))
     belief = believe_together(shares, probabilities, within, within_others, alone)
     found = recalibrate_at(member, support, gaussian.pose, elsewhere, means.workers)
-    result = judge_together(found, gaussian, belief, means, min_confidence)
-    doubts = (UNSEEN,) if shares.right < EVEN else ()
-    return replace(result, warnings=result.warnings + doubts + agreed.warnings)
+    return judge_together(found, gaussian, belief, means, min_confidence)
 
 
 def compare_errors(expected: PoseGaussian, own: PoseGaussian) -> float:
@@ -329,9 +361,9 @@ def compare_errors(expected: PoseGaussian, own: PoseGaussian) -> float:
 
 
 def recalibrate_at(
-    member: Member, support: Support, pose: Pose, elsewhere: Sequence[Bundle], workers: Workers
+    member: Member, support: Support, pose: Pose, elsewhere: Sequence[Pose], workers: Workers
 ) -> Found:
-    """Return a photo's poses by all photos: `pose`, and those that other poses of the bundle give it.
+    """Return a photo's poses by all photos: `pose`, and those that it has elsewhere.
 
     The focal length, if it is not exact, is fitted at the photo's own pose.
     """
@@ -340,5 +372,5 @@ def recalibrate_at(
     if isinstance(fit, FocalFit) and support.own.pose is not selection.best.pose:
         own = complete(problem, Selection(support.own, ()), workers)
         problem, _, fit = calibrate(problem, own, workers)
-    placed = [examine(problem, bundle.place(member.cam_from_bundle)) for bundle in elsewhere]
+    placed = [examine(problem, other) for other in elsewhere]
     return Found(problem, Selection(examine(problem, pose), tuple(placed)), fit)

@@ -46,7 +46,7 @@ class Member:
 
     found: Found  # without what takes memory
     alone: Localization
-    cam_from_bundle: Pose
+    cam_from_bundle: Pose  # of a group, whose relative poses are not known, the identity
 
     @property
     def is_misplaced(self) -> bool:
@@ -75,6 +75,13 @@ class Support(NamedTuple):
     odds_elsewhere: float  # of the places of the photo's other poses
     num_places: int  # of the scan where a photo alone may be
     odds_exchanged: float = 0.0  # of the places of other photos of the bundle, in the mean
+    belongs: float = 1.0 - CONTRADICTED  # probability beforehand that it is where others expect it
+    weight: float = 1.0  # of this evidence, less if other photos show the same
+
+    def miss(self) -> "Support":
+        """Return the photo's evidence for a place that it does not show."""
+        elsewhere = self.odds_elsewhere + self.odds
+        return self._replace(is_found=False, odds=0.0, odds_elsewhere=elsewhere)
 
     @property
     def weights(self) -> Array:
@@ -83,11 +90,11 @@ class Support(NamedTuple):
         The odds of a photo alone allow for `num_places` places, of which it has the best. If the others leave
         one place, or the few of exchanged photos, the odds are multiplied by `num_places`.
         """
-        belongs = 1.0 - CONTRADICTED
+        belongs = self.belongs
         here = self.odds * self.num_places
         right = belongs * (1.0 - self.local_share) * here
         exchanged = self.odds_exchanged * self.num_places
-        of_others = [CONTRADICTED, CONTRADICTED * (self.odds_elsewhere + exchanged)]
+        of_others = [1.0 - belongs, (1.0 - belongs) * (self.odds_elsewhere + exchanged)]
         return np.array([right, belongs * (self.local_share * here + SILENT), *of_others])
 
     @property
@@ -172,19 +179,18 @@ def vote(member: Member, bundle: Bundle) -> float:
 
 
 def find_support(
-    member: Member, problem: Problem, bundle: Bundle, workers: Workers, exchanged: Sequence[Pose] = ()
+    member: Member, problem: Problem, expected: Pose, workers: Workers, exchanged: Sequence[Pose] = ()
 ) -> Support:
-    """Return a photo's evidence for a bundle pose: its best own pose near the prediction.
+    """Return a photo's evidence for a pose that is expected of it: its best own pose near that.
 
-    `exchanged` are relative poses of other photos, one of which may be its own.
+    `exchanged` are poses that are expected of other photos, one of which may be its own.
     """
-    expected = bundle.place(member.cam_from_bundle)
     ranked = [own for own, _ in member.own_poses]
     own = next((h for h in ranked if ONE_IN_BUNDLE.holds(h.pose, expected)), None)
     found = own or max(list_near(problem, expected, workers), key=lambda h: h.score)
     if own is None:
         ranked.append(found)
-    places = [place for place in map(bundle.place, exchanged) if not ONE_IN_BUNDLE.holds(place, expected)]
+    places = [place for place in exchanged if not ONE_IN_BUNDLE.holds(place, expected)]
     ranked += [examine(problem, p) for p in places if not any(ONE_IN_BUNDLE.holds(h.pose, p) for h in ranked)]
     k = next(k for k, h in enumerate(ranked) if h is found)
     selection = complete(problem, Selection(ranked[0], tuple(ranked[1:])), workers)
@@ -219,22 +225,24 @@ def list_near(problem: Problem, expected: Pose, workers: Workers) -> list[Candid
 def weigh_bundles(tested: Sequence[Sequence[Support]], members: Sequence[Member]) -> Array:
     """Return the probability (K + 1,) of each of K poses of the bundle, and of none.
 
-    The photos are independent evidence, but a missed pose is charged once, as bare walls and changed places
-    lie together, and the third of the photos with the least odds is not charged. Agreement of photos counts
-    as far as it exceeds chance among all proposed poses. Wrong relative poses, with each photo at any of its
-    own poses, count as none.
+    The photos are independent evidence as far as they show different things, but a missed pose is charged
+    once, as bare walls and changed places lie together, and the third of the photos with the least odds is
+    not charged. Agreement of photos counts as far as it exceeds chance among all proposed poses. Wrong
+    relative poses, with each photo at any of its own poses, count as none.
     """
     num_proposed = max(sum(len(member.own_poses) for member in members), 1)
     logits = []
     for of_one in tested:
         odds_of_seen = sorted(s.odds for s in of_one)[int(len(of_one) * MOST_UNSEEN) :]
         missed = min(math.log((o + MISSED) / (o + 1.0)) for o in odds_of_seen)
-        gain = (1 - sum(s.is_found for s in of_one)) * math.log(CHANCE)
+        gain = (1.0 - sum(s.weight for s in of_one if s.is_found)) * math.log(CHANCE)
         coincidence = max(gain - math.log(num_proposed), min(gain, 0.0))
-        of_photos = sum(math.log1p(s.odds + CONTRADICTED * s.odds_elsewhere) for s in of_one)
+        of_photos = sum(s.weight * math.log1p(s.odds + CONTRADICTED * s.odds_elsewhere) for s in of_one)
         logits.append(of_photos + missed + coincidence)
     alone = [sum(p for _, p in member.own_poses) for member in members]
-    apart = math.log(CONTRADICTED) - sum(math.log(max(1.0 - p, LEAST_NONE)) for p in alone)
+    weights = [max((of_one[k].weight for of_one in tested), default=1.0) for k in range(len(members))]
+    sure = [-math.log(max(1.0 - p, LEAST_NONE)) for p in alone]
+    apart = math.log(CONTRADICTED) + sum(w * s for w, s in zip(weights, sure, strict=True))
     odds = np.exp(np.array([*logits, 0.0, apart]) - max([*logits, 0.0, apart]))
     odds = np.append(odds[:-2], odds[-2:].sum())
     return np.asarray(odds / odds.sum())

@@ -1,0 +1,223 @@
+"""Photos of one place whose relative poses are not known, localized together.
+
+Each photo is searched by itself. From each of its likely poses those of the others follow by their matches
+(`links`): that is a place of the group. The best places are tested in every photo, and weighed as poses of a
+bundle are. Photos that do not belong to the best place may belong to another; else each keeps its own result.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arrays import Array
+from ..evidence.verification import match_covariance
+from ..geometry.nearness import ONE_IN_BUNDLE
+from ..geometry.pose import Pose
+from ..geometry.pose_gaussian import PoseGaussian
+from ..judge.by_others import Shares
+from ..judge.localization import Localization
+from ..local_features.hypotheses import count_matches
+from ..local_features.matching import merge_matches
+from ..localization.means import Means
+from .bundle import EVEN, LOCAL_ERRORS, judge_placed, place_between
+from .bundle_search import NUM_BUNDLES, Member, Support, find_support, weigh_bundles
+from .links import FIRM, WEAK, Links, Places, are_bridged, compute_shared, find_links, find_pose, spread
+
+NUM_LIKELY = 2  # poses of a photo from which a place of the group may follow, the likeliest
+LEAST_LIKELY = 1e-3  # chosen: probability of such a pose
+MOST_SPREAD = 12  # places of the group that are looked at
+BELONGS_WEAKLY = 0.7  # chosen: probability that a photo belongs where few matches put it
+MOST_SOURCES = 3  # photos by which a photo is placed, those with the most matches
+UNCERTAIN = np.zeros((6, 6))
+
+
+class Group(NamedTuple):
+    """Photos that may belong together."""
+
+    links: Links
+    members: Mapping[int, Member]  # by number
+
+
+class Tested(NamedTuple):
+    """A place of a group, tested in its photos."""
+
+    places: Places
+    supports: dict[int, Support]
+
+
+def localize_linked(
+    members: Mapping[int, Member], means: Means, min_confidence: float
+) -> dict[int, Localization]:
+    """Return the results of those photos that are localized together, by their numbers."""
+    links = find_links({k: member.found.problem for k, member in members.items()}, means.workers)
+    group = Group(links, members)
+    results: dict[int, Localization] = {}
+    for numbers in links.list_groups():
+        left = set(numbers)
+        while proposed := propose_places(group, left):
+            tested, probabilities = weigh_places(group, proposed, left, means)
+            found = {}
+            if probabilities[0] >= EVEN:
+                found = judge_group(group, tested, probabilities, means, min_confidence)
+            results |= found
+            left -= found.keys() or tested[0].places.keys()
+    return results
+
+
+def propose_places(group: Group, numbers: Collection[int]) -> list[Places]:
+    """Return places of two and more photos, those with the most votes of the photos' own poses first."""
+    own = [
+        (-probability, number, candidate.pose)
+        for number in sorted(numbers)
+        for candidate, probability in group.members[number].own_poses[:NUM_LIKELY]
+        if probability > LEAST_LIKELY
+    ]
+    found: list[Places] = []
+    for _, number, pose in sorted(own, key=lambda one: one[:2]):
+        is_known = any(number in one and ONE_IN_BUNDLE.holds(one[number].pose, pose) for one in found)
+        if not is_known and len(found) < MOST_SPREAD:
+            anchor = {number: group.links.place(number, pose)}
+            found.append(spread(group.links, anchor, numbers, FIRM))
+    settled = [settle(group, places, numbers) for places in join_bridged(group.links, found)]
+    kept: list[Places] = []
+    for places in sorted(settled, key=lambda places: -count_votes(group, places)):
+        if len(places) > 1 and not any(is_same_place(places, other) for other in kept):
+            kept.append(places)
+    return kept[:NUM_BUNDLES]
+
+
+def join_bridged(links: Links, found: Sequence[Places]) -> list[Places]:
+    """Join places that have no photo in common, if matches between their photos agree with both."""
+    joined: list[Places] = []
+    for places in found:
+        bridged = next((k for k, other in enumerate(joined) if are_bridged(links, places, other)), None)
+        if bridged is None:
+            joined.append(places)
+        else:
+            joined[bridged] = {**joined[bridged], **places}
+    return joined
+
+
+def is_same_place(one: Places, other: Places) -> bool:
+    """Return True if two places have photos in common, all at the same poses."""
+    common = one.keys() & other.keys()
+    return bool(common) and all(ONE_IN_BUNDLE.holds(one[k].pose, other[k].pose) for k in common)
+
+
+def find_own(member: Member, pose: Pose) -> tuple[Pose, float]:
+    """Return a photo's own pose near another, and its probability; the other, and 0, if it has none."""
+    near = (one for one in member.own_poses if ONE_IN_BUNDLE.holds(one[0].pose, pose))
+    return next(((candidate.pose, probability) for candidate, probability in near), (pose, 0.0))
+
+
+def count_votes(group: Group, places: Places) -> float:
+    """Return the sum of the probabilities of the photos' own poses where they are placed."""
+    return sum(find_own(group.members[k], placed.pose)[1] for k, placed in places.items())
+
+
+def settle(group: Group, places: Places, numbers: Collection[int]) -> Places:
+    """Place the photos again, by those whose own poses are likely and where they are expected to be."""
+    own = {k: find_own(group.members[k], placed.pose) for k, placed in places.items()}
+    anchors = {k: group.links.place(k, pose) for k, (pose, probability) in own.items() if probability > EVEN}
+    return spread(group.links, anchors, numbers, FIRM) if anchors else places
+
+
+def weigh_places(
+    group: Group, proposed: Sequence[Places], numbers: Collection[int], means: Means
+) -> tuple[list[Tested], Array]:
+    """Test the best place, and those that put some of its photos elsewhere; return them, the likeliest first.
+
+    Return also the probability (K + 1,) of each of them, and of none, by all photos that have any of them.
+    """
+    rivals = [places for places in proposed[1:] if places.keys() & proposed[0].keys()]
+    tested = [examine_place(group, places, numbers, means) for places in (proposed[0], *rivals)]
+    every = sorted({number for one in tested for number in one.supports})
+    missed = {k: next(one.supports[k] for one in tested if k in one.supports).miss() for k in every}
+    supports = [[one.supports.get(k, missed[k]) for k in every] for one in tested]
+    probabilities = weigh_bundles(supports, [group.members[k] for k in every])
+    order = np.argsort(-probabilities[:-1], kind="stable")
+    return [tested[k] for k in order], np.append(probabilities[order], probabilities[-1])
+
+
+def examine_place(group: Group, places: Places, numbers: Collection[int], means: Means) -> Tested:
+    """Test a place in each of its photos, and in those that few matches put there.
+
+    What several photos show counts once.
+    """
+    every = spread(group.links, places, numbers, WEAK)
+    supports = {}
+    for number, placed in every.items():
+        member = group.members[number]
+        support = find_support(member, member.found.problem.forget(), placed.pose, means.workers)
+        weight = 1.0 / (1.0 + compute_shared(group.links, every, number))
+        belongs = support.belongs if number in places else BELONGS_WEAKLY
+        supports[number] = support._replace(weight=weight, belongs=belongs)
+    return Tested(every, supports)
+
+
+def judge_group(
+    group: Group, tested: Sequence[Tested], probabilities: Array, means: Means, min_confidence: float
+) -> dict[int, Localization]:
+    """Return the results of the photos that belong to the first of several places of their group."""
+    best, *elsewhere = tested
+    own = {
+        number: support.gaussian.blur(support.local_share * LOCAL_ERRORS)
+        for number, support in best.supports.items()
+        if support.shares.argmax() == 0 and support.gaussian is not None
+    }
+    expected = expect_all(group.links, best.places, own)
+    results = {}
+    for number, support in best.supports.items():
+        member = group.members[number]
+        belongs = Shares(*support.shares[:2].tolist())
+        placed = place_between(belongs, own.get(number), expected.get(number))
+        is_refused = bool(member.alone.belief.ruled_out) and not member.is_misplaced
+        if is_refused or belongs.here < EVEN or placed.gaussian is None:
+            continue
+        others = [k for k, one in enumerate(elsewhere) if number in one.places]
+        poses = [elsewhere[k].places[number].pose for k in others]
+        of_places = probabilities[[0, *(k + 1 for k in others)]]
+        of_all = np.append(of_places, 1.0 - of_places.sum())
+        results[number] = judge_placed(
+            member, support, placed, number in own, poses, of_all, means, min_confidence
+        )
+    return results
+
+
+def expect_all(links: Links, places: Places, own: Mapping[int, PoseGaussian]) -> dict[int, PoseGaussian]:
+    """Return where the others expect each photo, by their own poses or by where they are expected."""
+    located = {k: links.place(k, gaussian.pose) for k, gaussian in own.items()}
+    known = dict(own)
+    expected: dict[int, PoseGaussian] = {}
+    for number in [*own, *(k for k in places if k not in own)]:
+        rest = {k: gaussian for k, gaussian in known.items() if k != number}
+        found = expect(links, number, {k: located[k] for k in rest}, rest)
+        if found is not None:
+            expected[number] = found
+            if number not in own:
+                known[number] = found
+                located[number] = links.place(number, found.pose)
+    return expected
+
+
+def expect(
+    links: Links, number: int, located: Places, known: Mapping[int, PoseGaussian]
+) -> PoseGaussian | None:
+    """Return the pose of a photo by its matches with others; None if too few agree.
+
+    Its errors are those of the matches, and of the poses of the photos with the most of them.
+    """
+    parts = links.match(number, located)
+    pose = None
+    if parts:
+        pose = find_pose(parts.values(), [known[k].pose for k in parts], WEAK, links.workers)
+    if pose is None:
+        return None
+    counts = {k: count_matches(matches, pose) for k, matches in parts.items()}
+    sources = sorted(counts, key=lambda k: -counts[k])[:MOST_SOURCES]
+    shares = np.array([counts[k] for k in sources]) / sum(counts[k] for k in sources)
+    attached = [known[k].attach(pose @ known[k].pose.inverse(), UNCERTAIN) for k in sources]
+    own = sum((share**2 * one.own for share, one in zip(shares, attached, strict=True)), UNCERTAIN)
+    common = sum((share * one.common for share, one in zip(shares, attached, strict=True)), UNCERTAIN)
+    return PoseGaussian(pose, own + match_covariance(merge_matches(list(parts.values())), pose), common)

@@ -1,0 +1,202 @@
+"""Links between photos: matches of their keypoints, and the poses that follow from each other's by them.
+
+Two photos alone tell little of how a camera turned and moved between them: a short way hardly differs from a
+turn, and a wall has two solutions. The scan has the depth that they lack. If a photo was taken at a supposed
+pose, its keypoints get their ranges there, and their matches with those of another photo give that one's pose
+by P3P, and so on from photo to photo.
+"""
+
+import itertools
+import math
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Array32
+from ..evidence.verification import Located, find_ranges, pair
+from ..geometry.pose import Pose, rotate_points
+from ..geometry.sphere import compute_indices
+from ..jobs.threads import Workers
+from ..local_features.hypotheses import count_matches, propose_poses
+from ..local_features.keypoints import Keypoints
+from ..local_features.matching import Matches, match_pictures, merge_matches
+from ..problem.problem import Problem
+
+LEAST_LINKED = 6  # matches of two photos that may show the same
+LEAST_BRIDGE = 5  # matches that agree with two poses that were found apart
+NUM_PROPOSED = 4  # poses by matches, of which the first that is allowed counts
+MOST_EACH = 40  # chosen: of more photos, each is matched with those only that look most like it
+NUM_LIKE = 20  # chosen: such photos
+NUM_LARGEST = 64  # chosen: keypoints of a photo by which these are found
+Pair = tuple[NDArray[np.intp], NDArray[np.intp]]  # keypoints (M,) of a photo, and of another
+
+
+class Trust(NamedTuple):
+    """What is asked of the matches by which a photo is placed."""
+
+    least: int  # that agree with a pose
+    reach: float  # [m] from the nearest photo that it is matched with
+
+
+FIRM = Trust(12, math.inf)  # of repeated patterns, as ceilings have, 8 matches agree by chance
+WEAK = Trust(6, 1.0)  # of photos that are taken at one spot
+
+
+class Placed(NamedTuple):
+    """A photo at a supposed pose in the map."""
+
+    pose: Pose
+    ranges: Array32  # (N,) [m] of its keypoints there, by the scan; 0 of those that it does not explain
+
+
+Places = Mapping[int, Placed]  # of photos, by their numbers
+
+
+@dataclass(frozen=True)
+class Links:
+    """Photos, by their numbers, and which of their keypoints match."""
+
+    problems: Mapping[int, Problem]
+    keypoints: Mapping[int, Keypoints]
+    pairs: Mapping[tuple[int, int], Pair]
+    workers: Workers
+
+    def list_linked(self, number: int) -> list[int]:
+        """List the photos that may show the same as one."""
+        return [other for own, other in self.pairs if own == number]
+
+    def list_groups(self) -> list[list[int]]:
+        """List the groups of photos that are linked, directly or by others; each in order."""
+        left = sorted(self.problems)
+        groups = []
+        while left:
+            group = left[:1]
+            for number in group:
+                group += [other for other in self.list_linked(number) if other not in group]
+            groups.append(sorted(group))
+            left = [number for number in left if number not in group]
+        return groups
+
+    def place(self, number: int, pose: Pose) -> Placed:
+        """Suppose that a photo was taken at a pose."""
+        return Placed(pose, find_ranges(self.problems[number], pose, self.workers))
+
+    def match(self, number: int, places: Places) -> dict[int, Matches]:
+        """Return the matches of a photo with each of those placed ones that are linked with it."""
+        matches = {}
+        for other in (other for other in self.list_linked(number) if other in places):
+            pose, ranges = places[other]
+            mine, theirs = self.pairs[number, other]
+            is_seen = ranges[theirs] > 0.0
+            located = Located(self.keypoints[other], ranges, pose)
+            matches[other] = pair(self.keypoints[number], mine[is_seen], located, theirs[is_seen])
+        return matches
+
+
+def find_links(problems: Mapping[int, Problem], workers: Workers) -> Links:
+    """Match the photos with each other; many, each with those that look most like it."""
+    keypoints = {number: problem.photo.seen(workers).keypoints for number, problem in problems.items()}
+    asked = list_pairs(keypoints, workers)
+    found = workers.map(lambda two: match_two(keypoints[two[0]], keypoints[two[1]]), asked, "match")
+    pairs: dict[tuple[int, int], Pair] = {}
+    for (one, other), (mine, theirs) in zip(asked, found, strict=True):
+        if len(mine) >= LEAST_LINKED:
+            pairs[one, other] = mine, theirs
+            pairs[other, one] = theirs, mine
+    return Links(problems, keypoints, pairs, workers)
+
+
+def list_pairs(keypoints: Mapping[int, Keypoints], workers: Workers) -> list[tuple[int, int]]:
+    """List the pairs of photos to be matched: all, or of many those whose largest keypoints match best."""
+    every = list(itertools.combinations(sorted(keypoints), 2))
+    if len(keypoints) <= MOST_EACH:
+        return every
+    largest = {
+        number: one.take(np.argsort(-one.sizes, kind="stable")[:NUM_LARGEST])
+        for number, one in keypoints.items()
+    }
+    counts = workers.map(
+        lambda two: len(match_pictures(largest[two[0]], largest[two[1]])[0]), every, "compare photos"
+    )
+    like: dict[int, list[tuple[int, tuple[int, int]]]] = {number: [] for number in keypoints}
+    for two, count in zip(every, counts, strict=True):
+        for number in two:
+            like[number].append((-count, two))
+    return sorted({two for ranked in like.values() for _, two in sorted(ranked)[:NUM_LIKE]})
+
+
+def match_two(one: Keypoints, other: Keypoints) -> Pair:
+    """Return the keypoints of two photos that match; none if the one mirrored has more matches."""
+    mine, theirs = match_pictures(one, other)
+    if len(mine) >= LEAST_LINKED and len(match_pictures(one.mirror(), other)[0]) > len(mine):
+        return mine[:0], theirs[:0]
+    return mine, theirs
+
+
+def spread(links: Links, anchors: Places, numbers: Collection[int], trust: Trust) -> Places:
+    """Place photos that are linked with anchors, and those that are linked with these, and so on.
+
+    The photo with the most matches comes first; one that can't be placed is tried again when more photos that
+    it is linked with are placed.
+    """
+    places = dict(anchors)
+    tried = set[tuple[int, int]]()  # with the number of photos that it was matched with
+    while True:
+        asked = {number: links.match(number, places) for number in numbers if number not in places}
+        counts = {
+            number: sum(len(matches.query) for matches in parts.values())
+            for number, parts in asked.items()
+            if (number, len(parts)) not in tried
+        }
+        number = max(counts, key=counts.__getitem__, default=None)
+        if number is None or counts[number] < trust.least:
+            return places
+        tried.add((number, len(asked[number])))
+        near = [places[other].pose for other in asked[number]]
+        pose = find_pose(asked[number].values(), near, trust, links.workers)
+        if pose is not None:
+            places[number] = links.place(number, pose)
+
+
+def find_pose(
+    matches: Iterable[Matches], near: Collection[Pose], trust: Trust, workers: Workers
+) -> Pose | None:
+    """Return a photo's pose by its matches with others, whose poses are `near`; None if too few agree."""
+    proposed = propose_poses(merge_matches(list(matches)), NUM_PROPOSED, workers)
+    for pose in (one.pose for one in proposed if one.num_matches >= trust.least):
+        if min(pose.distance(other) for other in near) <= trust.reach:
+            return pose
+    return None
+
+
+def are_bridged(links: Links, one: Places, other: Places) -> bool:
+    """Return True if matches between photos that were placed apart agree with both."""
+    if one.keys() & other.keys():
+        return False
+    counts = (
+        count_matches(matches, placed.pose)
+        for number, placed in one.items()
+        for matches in links.match(number, other).values()
+    )
+    return max(counts, default=0) >= LEAST_BRIDGE
+
+
+def compute_shared(links: Links, places: Places, number: int) -> float:
+    """Return how often what a photo shows is shown by others: 1 if one other shows all of it."""
+    pose, ranges = places[number]
+    is_seen = ranges > 0.0
+    if not is_seen.any():
+        return 0.0
+    rays = links.keypoints[number].rays[is_seen].astype(np.float64)
+    points = pose.center_world + ranges[is_seen, None] * rotate_points(rays, pose.R_cam_from_world.T)
+    shares = []
+    for other, at in places.items():
+        if other != number:
+            offsets = rotate_points(points - at.pose.center_world, at.pose.R_cam_from_world)
+            distances = np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-9)
+            is_valid = links.problems[other].photo.panorama.is_valid
+            shares.append(is_valid[compute_indices(offsets / distances, is_valid.shape[1])].mean())
+    return float(sum(shares))
