@@ -49,7 +49,7 @@ def _alone(*probabilities):
     alternatives = tuple(Alternative(h.pose, h.score, None, p) for h, p in likely[1:])
     alone = Localization(belief=make_belief(probabilities), pose=poses[0].pose, alternatives=alternatives)
     found = Found(None, Selection(poses[0], tuple(poses[1:])), None)
-    return bundle_search.Member(found, alone, tilted_poses(1, NEAR)[0])
+    return bundle_search.PosedMember(found, alone, tilted_poses(1, NEAR)[0])
 
 
 MISSES = _support(0.0, is_found=False)
@@ -114,8 +114,8 @@ def test_a_certain_place_counts_whole_however_inexact_the_pose_is(std):
         std_of_fit=0.005,
     )
     found = Found(problem, Selection(best, (other,)), None)
-    member = bundle_search.Member(found, alone, Pose(np.eye(3), np.zeros(3)))
-    support = bundle_search.find_support(member, problem, Bundle(best.pose), Workers())
+    member = bundle_search.PosedMember(found, alone, Pose(np.eye(3), np.zeros(3)))
+    support = bundle_search.find_support(member, problem, best.pose, Workers())
     assert support.own.pose is best.pose
     assert support.odds > 5e4
     assert [p for _, p in member.own_poses] == [0.99, 0.001]
@@ -165,7 +165,7 @@ def test_an_own_pose_far_from_the_one_expected_is_doubted():
 def _members(far):
     """Two photos whose common frame begins `far` [m] from them."""
     cams = [Pose(pose.R_cam_from_world, pose.center_world + far) for pose in tilted_poses(2, NEAR)]
-    return [bundle_search.Member(Found(None, None, None), Localization(), cam) for cam in cams]
+    return [bundle_search.PosedMember(Found(None, None, None), Localization(), cam) for cam in cams]
 
 
 @pytest.mark.parametrize("far", [0.0, 1e3])

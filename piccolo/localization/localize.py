@@ -155,15 +155,21 @@ def has_guessed_focal(panorama: Panorama) -> bool:
     return panorama.focal_prior is not None and panorama.focal_prior.deviation > WIDE
 
 
+def list_guessed(panorama: Panorama) -> list[Panorama]:
+    """Return a photo with several focal lengths around a guess; as it is if its own is none."""
+    if not has_guessed_focal(panorama):
+        return [panorama]
+    camera = panorama.cameras[0].camera
+    width = panorama.rgb.shape[1]
+    return [panorama.resample(camera.change(guess), width) for guess in GUESSES]
+
+
 def localize_guessed(
     scan_map: ScanMap, panorama: Panorama, settings: CoarseToFineSettings, means: Means
 ) -> Localization:
     """Localize a photo with several focal lengths around a guess, until one result is sure."""
-    camera = panorama.cameras[0].camera
-    width = panorama.rgb.shape[1]
     found: list[Localization] = []
-    for guess in GUESSES:
-        photo = panorama.resample(camera.change(guess), width)
+    for photo in list_guessed(panorama):
         found.append(localize(scan_map, photo, settings, means))
         if found[-1].status == LOCALIZED:
             break

@@ -22,12 +22,11 @@ from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.by_others import Shares, believe_together
 from ..judge.candidate import Selection
-from ..judge.consensus import MOST_CONFLICT, Consensus
+from ..judge.consensus import MOST_CONFLICT
 from ..judge.localization import Localization
 from ..judge.probability import LOCALIZED
 from ..localization.calibration import calibrate
-from ..localization.judging import Found, judge, judge_together
-from ..localization.localize import explain_nothing, find, find_by_edges, prepare_search
+from ..localization.judging import Found, judge_together
 from ..localization.means import Means
 from ..panorama import Panorama
 from ..problem.settings import CoarseToFineSettings
@@ -44,13 +43,14 @@ from .bundle_adjustment import (
     find_scale,
 )
 from .bundle_search import (
-    Member,
+    PosedMember,
     Support,
     find_support,
     move_origin_near,
     propose_bundles,
     weigh_bundles,
 )
+from .members import Member, find_members
 
 EVEN = 0.5
 LOCAL_ERRORS = np.diag(np.repeat([math.radians(2.0) ** 2, 0.15**2], 3))  # chosen: of local optima, [rad, m]
@@ -87,51 +87,17 @@ def localize_bundle(
 
     `errors` are those expected of these poses; their scale is unknown if its deviation is large.
     """
-    cams_from_bundle = move_origin_near(cams_from_bundle)
-    members: dict[int, Member] = {}
     means = Means(settings.effort, workers, watch)
-
-    def localize_alone(k: int, panorama: Panorama) -> Localization:
-        problem = prepare_search(scan_map, panorama, settings, watch)
-        if problem is None:
-            return explain_nothing(scan_map, panorama, settings.prior)
-        search = find_by_edges if problem.profile.has_shape else find
-        found = search(problem, scan_map, means)
-        judged = judge(found, means, settings.min_confidence, may_promote=False)
-        members[k] = Member(found.forget(), judged, cams_from_bundle[k])
-        return judged
-
-    alone = [localize_alone(k, panorama) for k, panorama in enumerate(panoramas)]
-    for k, panorama in expect_focal(panoramas, alone).items():
-        members.pop(k, None)
-        alone[k] = localize_alone(k, panorama)
-    members = dict(sorted(members.items()))
+    alone, found = find_members(scan_map, panoramas, settings, means)
+    cams = move_origin_near(cams_from_bundle)
+    members = {k: PosedMember(member.found, member.alone, cams[k]) for k, member in sorted(found.items())}
     with watch.stage("refine"):
         together = judge_members(members, errors, means, settings.min_confidence)
     return [together.get(k, one) for k, one in enumerate(alone)]
 
 
-def expect_focal(panoramas: Sequence[Panorama], alone: Sequence[Localization]) -> dict[int, Panorama]:
-    """Return the photos that are not sure, by number, with the focal length that those that are sure tell.
-
-    The photos are of one camera: what was given and what these say are averaged.
-    """
-    opinions = [one.focal_length.opinion for one in alone if one.status == LOCALIZED and one.focal_length]
-    told = Consensus(opinions).opinion(least=1)
-    if told is None:
-        return {}
-    expected: dict[int, Panorama] = {}
-    for k, (panorama, one) in enumerate(zip(panoramas, alone, strict=True)):
-        prior = panorama.focal_prior
-        if one.status != LOCALIZED and prior is not None:
-            share = told.share_of_given(prior.deviation)
-            focal_px = prior.focal * math.exp((1.0 - share) * told.off)
-            expected[k] = panorama.expect_focal(focal_px, prior.deviation * math.sqrt(share))
-    return expected
-
-
 def judge_members(
-    members: dict[int, Member], errors: RelativeErrors, means: Means, min_confidence: float
+    members: dict[int, PosedMember], errors: RelativeErrors, means: Means, min_confidence: float
 ) -> dict[int, Localization]:
     """Return the results of photos together, or each by itself with the reason."""
     workers = means.workers
@@ -173,14 +139,14 @@ def judge_members(
     return {k: judge_one(members[k], k, supports[k], min_confidence) for k in members}
 
 
-def list_neighbors(members: dict[int, Member], k: int) -> list[Pose]:
+def list_neighbors(members: dict[int, PosedMember], k: int) -> list[Pose]:
     """Return the relative poses of the photos next to one in order, which may be its own by mistake."""
     others = sorted((j for j in members if j != k), key=lambda j: abs(j - k))
     return [members[j].cam_from_bundle for j in others[:NUM_NEIGHBORS]]
 
 
 def agree(
-    members: dict[int, Member], bundle: Bundle, supports: dict[int, Support], errors: RelativeErrors
+    members: dict[int, PosedMember], bundle: Bundle, supports: dict[int, Support], errors: RelativeErrors
 ) -> Agreed | str:
     """Adjust the bundle to the photos whose own poses agree with it; a text says why it is not believed.
 
@@ -267,7 +233,7 @@ class Placement(NamedTuple):
     within_others: float  # probability that it is within 0.1 m if the pose that the others expect is right
 
 
-def place_member(member: Member, number: int, shares: Shares, agreed: Agreed) -> Placement:
+def place_member(member: PosedMember, number: int, shares: Shares, agreed: Agreed) -> Placement:
     """Place a photo by its own pose, and by where the others expect it."""
     rest = [estimate for k, estimate in agreed.estimates.items() if k != number]
     estimate = agreed.estimates.get(number)
@@ -292,7 +258,7 @@ def place_between(shares: Shares, own: PoseGaussian | None, expected: PoseGaussi
 
 
 def judge_member(
-    member: Member,
+    member: PosedMember,
     number: int,
     support: Support,
     min_confidence: float,

@@ -19,16 +19,14 @@ from ..jobs.threads import Workers
 from ..judge.by_others import LEAST_NONE
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Errors
-from ..judge.consensus import MOST_CONFLICT
-from ..judge.localization import Localization
 from ..judge.probability import CONTRADICTED, posterior
 from ..judge.selection import assess
-from ..localization.judging import Found
 from ..localization.ladder import refine
 from ..localization.last_descent import HOPELESS_SCORE
 from ..problem.problem import Problem
 from ..problem.stages import FINE
 from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
+from .members import Member
 
 MISSED = 0.25  # chosen: of photos, those without a right pose found (of BENCHMARK.md's phone photos a sixth)
 MOST_UNSEEN = 1.0 / 3.0  # chosen: of photos, those that may show nothing
@@ -41,28 +39,10 @@ NUM_LIKELY = 2  # poses of a photo that propose a scale, those with the most pro
 
 
 @dataclass(frozen=True)
-class Member:
-    """A photo of the bundle, found by itself."""
+class PosedMember(Member):
+    """A photo whose pose relative to the others is known."""
 
-    found: Found  # without what takes memory
-    alone: Localization
-    cam_from_bundle: Pose  # of a group, whose relative poses are not known, the identity
-
-    @property
-    def is_misplaced(self) -> bool:
-        """True if its focal length contradicts that of the other photos, as at a wrong place."""
-        prior = self.found.problem.given.focal_prior
-        fit = self.found.fit
-        has_conflict = fit is not None and fit.conflict > MOST_CONFLICT
-        return has_conflict and prior is not None and prior.is_measured
-
-    @property
-    def own_poses(self) -> list[tuple[Candidate, float]]:
-        """Poses in the map with the probabilities of their places, best first; none if ruled out."""
-        if self.alone.pose is None or self.alone.belief.ruled_out:
-            return []
-        places = self.alone.belief.sound_places[:-1].tolist()
-        return list(zip(self.found.selection.candidates, places, strict=False))
+    cam_from_bundle: Pose
 
 
 class Support(NamedTuple):
@@ -114,7 +94,7 @@ def move_origin_near(cams_from_bundle: Sequence[Pose]) -> list[Pose]:
     return [Pose(pose.R_cam_from_world, pose.center_world - mean) for pose in cams_from_bundle]
 
 
-def propose_bundles(members: Sequence[Member], errors: RelativeErrors) -> list[Bundle]:
+def propose_bundles(members: Sequence[PosedMember], errors: RelativeErrors) -> list[Bundle]:
     """Return distinct poses of the bundle in the map, the likeliest first, by the photos' own poses."""
     proposed = [
         Bundle(member.cam_from_bundle.inverse() @ own.pose)
@@ -134,7 +114,7 @@ def propose_bundles(members: Sequence[Member], errors: RelativeErrors) -> list[B
 
 
 def propose_with_scale(
-    one: Member, own: Pose, other: Member, own_of_other: Pose, errors: RelativeErrors
+    one: PosedMember, own: Pose, other: PosedMember, own_of_other: Pose, errors: RelativeErrors
 ) -> list[Bundle]:
     """Return the bundle whose scale is that of two photos' own poses; nothing if these do not fit."""
     relative = other.cam_from_bundle @ one.cam_from_bundle.inverse()
@@ -153,7 +133,7 @@ def propose_with_scale(
     return [Bundle(scaled.inverse() @ own, math.log(scale))]
 
 
-def join_near(members: Sequence[Member], bundle: Bundle, errors: RelativeErrors) -> Bundle:
+def join_near(members: Sequence[PosedMember], bundle: Bundle, errors: RelativeErrors) -> Bundle:
     """Adjust a bundle to the photos' poses near it, all of one deviation."""
     nothing = np.zeros((6, 6))
     near = []
@@ -166,13 +146,13 @@ def join_near(members: Sequence[Member], bundle: Bundle, errors: RelativeErrors)
     return adjust(bundle, near, loose).bundle if len(near) > 1 else bundle
 
 
-def is_same_bundle(members: Sequence[Member], bundle: Bundle, other: Bundle) -> bool:
+def is_same_bundle(members: Sequence[PosedMember], bundle: Bundle, other: Bundle) -> bool:
     """Return True if two poses of the bundle put every photo at the same place."""
     cams = [member.cam_from_bundle for member in members]
     return all(ONE_IN_BUNDLE.holds(bundle.place(cam), other.place(cam)) for cam in cams)
 
 
-def vote(member: Member, bundle: Bundle) -> float:
+def vote(member: PosedMember, bundle: Bundle) -> float:
     """Return the probability of a photo's own pose that supports a pose of the bundle."""
     expected = bundle.place(member.cam_from_bundle)
     return max((p for own, p in member.own_poses if ONE_IN_BUNDLE.holds(own.pose, expected)), default=0.0)
@@ -240,9 +220,9 @@ def weigh_bundles(tested: Sequence[Sequence[Support]], members: Sequence[Member]
         of_photos = sum(s.weight * math.log1p(s.odds + CONTRADICTED * s.odds_elsewhere) for s in of_one)
         logits.append(of_photos + missed + coincidence)
     alone = [sum(p for _, p in member.own_poses) for member in members]
-    weights = [max((of_one[k].weight for of_one in tested), default=1.0) for k in range(len(members))]
+    weights = [max(s.weight for s in of_photo) for of_photo in zip(*tested, strict=True)]
     sure = [-math.log(max(1.0 - p, LEAST_NONE)) for p in alone]
-    apart = math.log(CONTRADICTED) + sum(w * s for w, s in zip(weights, sure, strict=True))
+    apart = math.log(CONTRADICTED) + sum(w * s for w, s in zip(weights, sure, strict=False))
     odds = np.exp(np.array([*logits, 0.0, apart]) - max([*logits, 0.0, apart]))
     odds = np.append(odds[:-2], odds[-2:].sum())
     return np.asarray(odds / odds.sum())

@@ -6,6 +6,7 @@ bundle are. Photos that do not belong to the best place may belong to another; e
 """
 
 from collections.abc import Collection, Mapping, Sequence
+from hashlib import sha256
 from typing import NamedTuple
 
 import numpy as np
@@ -15,14 +16,19 @@ from ..evidence.verification import match_covariance
 from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
+from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.by_others import Shares
 from ..judge.localization import Localization
 from ..local_features.hypotheses import count_matches
 from ..local_features.matching import merge_matches
 from ..localization.means import Means
+from ..panorama import Panorama
+from ..problem.settings import CoarseToFineSettings
+from ..scan_map.scan_map import ScanMap
 from .bundle import EVEN, LOCAL_ERRORS, judge_placed, place_between
-from .bundle_search import NUM_BUNDLES, Member, Support, find_support, weigh_bundles
+from .bundle_search import NUM_BUNDLES, Support, find_support, weigh_bundles
 from .links import FIRM, WEAK, Links, Places, are_bridged, compute_shared, find_links, find_pose, spread
+from .members import Member, find_members
 
 NUM_LIKELY = 2  # poses of a photo from which a place of the group may follow, the likeliest
 LEAST_LIKELY = 1e-3  # chosen: probability of such a pose
@@ -44,6 +50,26 @@ class Tested(NamedTuple):
 
     places: Places
     supports: dict[int, Support]
+
+
+@one_blas_thread()
+def localize_group(
+    scan_map: ScanMap,
+    panoramas: Sequence[Panorama],
+    settings: CoarseToFineSettings,
+    workers: Workers,
+    watch: Stopwatch,
+) -> list[Localization]:
+    """Localize photos that may belong together, in any order; those that do not are localized alone."""
+    means = Means(settings.effort, workers, watch)
+    contents = [sha256(panorama.rgb.tobytes()).digest() for panorama in panoramas]
+    order = sorted(range(len(panoramas)), key=contents.__getitem__)  # results depend on no other
+    alone, members = find_members(scan_map, [panoramas[k] for k in order], settings, means)
+    with watch.stage("refine"):
+        narrow = {k: member for k, member in members.items() if not member.found.problem.profile.has_shape}
+        found = localize_linked(narrow, means, settings.min_confidence)
+    results = dict(zip(order, (found.get(k, one) for k, one in enumerate(alone)), strict=True))
+    return [results[k] for k in range(len(panoramas))]
 
 
 def localize_linked(

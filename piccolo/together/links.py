@@ -35,7 +35,7 @@ Pair = tuple[NDArray[np.intp], NDArray[np.intp]]  # keypoints (M,) of a photo, a
 
 
 class Trust(NamedTuple):
-    """What is asked of the matches by which a photo is placed."""
+    """The least that the matches by which a photo is placed must tell."""
 
     least: int  # that agree with a pose
     reach: float  # [m] from the nearest photo that it is matched with
