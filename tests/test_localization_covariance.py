@@ -76,7 +76,7 @@ def test_hessian_predicts_the_gradient_a_step_away(found):
     levels = covariance.to_levels(points.channels)
     seen = points.offsets, levels, points.weights
     problem = ChannelProblem(*seen, image.rgbx, image.width, covariance.SCALE)
-    hessian = covariance.compute_hessian(problem, pose, covariance.STEPS[0].turn, 3.0)
+    hessian = covariance.compute_hessian(problem, pose, WHOLE.steps[0].turn, 3.0)
     for delta in ([0.001, 0, 0, 0, 0.003, 0], [0, -0.0015, 0.001, 0.003, 0, -0.004]):
         moved = step(pose, np.array(delta))
         before, after = _gradients(problem, (pose, moved), pose.center_world)
@@ -136,7 +136,7 @@ def test_in_a_place_ten_times_as_large_a_position_is_known_a_tenth_as_well(found
 @pytest.mark.parametrize("num_rough", [0, 1, 2, 3])
 def test_where_the_finest_images_have_no_minimum_the_next_one_tells(num_rough):
     """Those that have one count alike."""
-    ways = (*covariance.STEPS, covariance.ROUGH_STEPS)
+    ways = (*WHOLE.steps, WHOLE.rough_steps)
     assert [steps.image for steps in ways] == ["full", "fine", "middle"]
     told = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     asked = []

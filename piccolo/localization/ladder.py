@@ -20,7 +20,7 @@ from ..panorama.local_normalization import LEVELS_PER_UNIT, to_levels
 from ..panorama.texels import Texels
 from ..problem.problem import Problem
 from ..problem.profile import VIEWS
-from ..problem.stages import AROUND_FINE, AROUND_MIDDLE, FINE, FULL, LAST, MIDDLE, SOFT, Limits, Stage
+from ..problem.stages import AROUND_FINE, AROUND_MIDDLE, FINE, FULL, LAST, MIDDLE, Limits, Stage
 from ..views.points_around import PLACE_SPACING
 from ..views.view import Cells
 
@@ -33,19 +33,15 @@ MAX_UNOCCLUDED = 2  # rounds that mask occluders
 MIN_SCORE_LEFT = 0.9  # fraction of the score that a descent on points must keep
 
 
-def refine(
-    problem: Problem, start: Pose, workers: Workers, first: Stage, then: Stage | None = None
-) -> Hypothesis:
-    """Descend from a pose through one or two stages, each on what is seen from where it begins.
+def refine(problem: Problem, start: Pose, workers: Workers, stage: Stage) -> Hypothesis:
+    """Descend from a pose through a stage, on what is seen from there.
 
-    The score of the end is that on the cells of the last view; nan on points.
+    The score of the end is that on the cells of the view; nan on points.
     """
-    cells = problem.view_at(start, first.view)
-    if first.around is None:
-        end = descend_on(problem, cells, start, first)
-    else:
-        end = descend_around(problem, cells, start, first, workers)
-    return end if then is None else refine(problem, end.pose, workers, then)
+    cells = problem.view_at(start, stage.view)
+    if stage.around is None:
+        return descend_on(problem, cells, start, stage)
+    return descend_around(problem, cells, start, stage, workers)
 
 
 def descend_on(problem: Problem, cells: Cells, pose: Pose, stage: Stage) -> Hypothesis:
@@ -135,7 +131,8 @@ def climb_masked(problem: Problem, start: Candidate, workers: Workers) -> Candid
     """Climb from a candidate, and from poses around it, with the photo that is masked there."""
     assert start.unoccluded is not None
     masked = problem.show(start.unoccluded.photo)
-    first = refine(masked, start.pose, workers, AROUND_MIDDLE, FINE)
+    around = refine(masked, start.pose, workers, AROUND_MIDDLE)
+    first = refine(masked, around.pose, workers, FINE)
     return examine(problem, climb(masked, first.pose, workers).pose, start)
 
 
@@ -160,9 +157,8 @@ def converge(problem: Problem, found: Candidate, stage: Stage, workers: Workers)
     pose = found.pose
     for k in range(stage.rounds.most):
         center = pose.center_world
-        is_soft = k == 0 and problem.profile.has_shape
-        stages = (SOFT, stage) if is_soft else (stage,)
-        pose = refine(shown, pose, workers, *stages).pose
+        for each in (*problem.profile.soft, stage) if k == 0 else (stage,):
+            pose = refine(shown, pose, workers, each).pose
         if math.dist(pose.center_world, center) < stage.rounds.arrived:
             break
     end = examine(problem, pose, found)

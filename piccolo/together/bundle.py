@@ -95,7 +95,7 @@ def localize_bundle(
         problem = prepare_search(scan_map, panorama, settings, watch)
         if problem is None:
             return explain_nothing(scan_map, panorama, settings.prior)
-        search = find_by_edges if problem.profile.has_shape else find
+        search = find_by_edges if problem.profile.follows_walls else find
         found = search(problem, scan_map, means)
         judged = judge(found, means, settings.min_confidence, may_promote=False)
         members[k] = Member(found.forget(), judged, cams_from_bundle[k])
