@@ -1,7 +1,7 @@
 """Covariance of a pose from blocks of the sphere."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from ..panorama.local_normalization import LEVELS_PER_UNIT, to_levels
 from ..panorama.texels import Texels
 from ..problem.photo_images import PhotoImages
 from ..problem.problem import Problem
-from ..problem.profile import DifferenceSteps, Profile
+from ..problem.profile import Profile
 from ..problem.stages import LAST
 from ..views.view import Cells
 from .comparison import mask_occluders
@@ -261,9 +261,7 @@ def disagreement(photo: PhotoImages, points: Cells, pose: Pose, covariance: Arra
     return added
 
 
-def compute_covariance(
-    photo: PhotoImages, points: Cells, pose: Pose, profile: Profile, workers: Workers
-) -> Array | None:
+def compute_covariance(photo: PhotoImages, points: Cells, pose: Pose, profile: Profile) -> Array | None:
     """Return the covariance (6, 6) [rad, m] in the camera's frame.
 
     Noise and stitching roughen the loss in the finest image; the next one is smoother. Those that are not too
@@ -275,26 +273,18 @@ def compute_covariance(
         return None
     median_range = compute_median_range(points)
     points, begins = sort_by_block(points)
-
-    def by(steps: DifferenceSteps) -> Array | None:
+    found: list[Array] = []
+    for steps in (*profile.steps, profile.rough_steps):
+        if found and steps is profile.rough_steps:
+            return merge_covariances(found)
         problem = make_problem(points, photo.image(steps.image))
         hessian = compute_hessian(problem, pose, steps.turn, median_range)
         gradients = block_gradients(sum_by_block(problem, pose, begins))
         covariance = sandwich_covariance(hessian, gradients)
-        if covariance is None:
-            return None
-        factor = few_blocks_factor(len(gradients)) if profile.has_few_blocks else 1.0
-        return steps.inflation * factor * covariance
-
-    return merge_images(by, profile, workers)
-
-
-def merge_images(
-    by: Callable[[DifferenceSteps], Array | None], profile: Profile, workers: Workers
-) -> Array | None:
-    """Merge the covariances by the finest images; if all are too rough, return that by the next one."""
-    found = [c for c in workers.map(by, profile.steps, "covariance") if c is not None]
-    return merge_covariances(found) if found else by(profile.rough_steps)
+        if covariance is not None:
+            factor = few_blocks_factor(len(gradients)) if profile.has_few_blocks else 1.0
+            found.append(steps.inflation * factor * covariance)
+    return found[0] if found else None
 
 
 def split_errors(problem: Problem, pose: Pose, covariance: Array) -> PoseGaussian:
@@ -355,7 +345,7 @@ def estimate_covariance(
     if leaves_out and candidate.seen.contradicts.any():
         points = remove_hidden(points, masked.panorama.is_valid, pose)
     photo = problem.photo if leaves_out else masked
-    covariance = compute_covariance(photo, points, pose, profile, workers)
+    covariance = compute_covariance(photo, points, pose, profile)
     if covariance is None:
         return UNKNOWN_ERRORS
     turned = pose.R_cam_from_world.T  # R_map_from_cam

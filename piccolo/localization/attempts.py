@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..evidence.examine import check_prior, choose, choose_among, examine
+from ..evidence.examine import check_prior, choose, examine
 from ..evidence.verification import Verified, draw_near, verify
 from ..geometry.pose import Pose
 from ..jobs.threads import Once, Workers
@@ -90,7 +90,7 @@ def look_first(problem: Problem, known: list[Candidate], means: Means) -> tuple[
             starts = search_poses(problem, "known", effort.brief(), workers)
         with watch.stage("refine"):
             found = known + refine_starts(problem, starts, FIRST_BEAM, workers)
-            if not is_clear(problem.profile, choose_among(problem, found, workers)):
+            if not is_clear(problem.profile, choose(problem, rank(found), workers)):
                 return found, False
             return found, beats_mirror(score_starts(problem, starts, workers), of_mirror())
 
@@ -111,7 +111,7 @@ def look_along_walls(problem: Problem, known: list[Candidate], means: Means) -> 
     refined = search_and_refine(problem, "known", FIRST_BEAM, means)
     with means.watch.stage("refine"):
         found = known + refined
-        return found, is_clear(problem.profile, choose_among(problem, found, means.workers))
+        return found, is_clear(problem.profile, choose(problem, rank(found), means.workers))
 
 
 def search_part(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:

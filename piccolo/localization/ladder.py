@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -158,7 +159,7 @@ def converge(problem: Problem, found: Candidate, stage: Stage, workers: Workers)
     for k in range(stage.rounds.most):
         center = pose.center_world
         for each in (*problem.profile.soft, stage) if k == 0 else (stage,):
-            pose = refine(shown, pose, workers, each).pose
+            pose = descend_on(shown, shown.view_at(pose, each.view), pose, each).pose
         if math.dist(pose.center_world, center) < stage.rounds.arrived:
             break
     end = examine(problem, pose, found)
@@ -180,14 +181,16 @@ def descend_perturbed(
     R_cam_from_map: Array,
     center: Array,
     scores: Array,
+    begin: int,
 ) -> None:
     """Perturb poses (n, 3, 3), (n, 3) by steps (n, 6) and descend in place, on the coarse then fine image.
 
-    `num_iterations` are those on each image. A pose with the zero step skips the coarse one.
+    These are PERTURBED_BATCH poses from `begin` on. `num_iterations` are those on each image. A pose with the
+    zero step skips the coarse one.
     """
     R = R_cam_from_map
     t = center
-    for k in range(len(steps)):
+    for k in range(begin, min(begin + PERTURBED_BATCH, len(steps))):
         retract(R[k].copy(), t[k].copy(), steps[k], R[k], t[k])
         first = 1
         for i in range(6):
@@ -242,24 +245,22 @@ def descend_around(problem: Problem, cells: Cells, pose: Pose, stage: Stage, wor
     scale = limits.loss_scale * LEVELS_PER_UNIT
     num_iterations = (stage.around.num_iterations, limits.num_iterations)
 
-    def run(lo: int) -> None:
-        part = slice(lo, lo + PERTURBED_BATCH)
-        descend_perturbed(
-            cells.offsets,
-            levels,
-            cells.weights,
-            blocks,
-            coarse,
-            fine,
-            scale,
-            limits.tolerance,
-            num_iterations,
-            steps[part],
-            R[part],
-            t[part],
-            scores[part],
-        )
-
-    workers.map(run, range(0, len(steps), PERTURBED_BATCH), "descend")
+    descend_from = partial(
+        descend_perturbed,
+        cells.offsets,
+        levels,
+        cells.weights,
+        blocks,
+        coarse,
+        fine,
+        scale,
+        limits.tolerance,
+        num_iterations,
+        steps,
+        R,
+        t,
+        scores,
+    )
+    workers.map(descend_from, range(0, len(steps), PERTURBED_BATCH), "descend")
     best = int(np.argmax(scores))
     return Hypothesis(Pose(orthonormal(R[best]), t[best] + cells.center_map), float(scores[best]))
