@@ -76,7 +76,7 @@ def test_hessian_predicts_the_gradient_a_step_away(found):
     levels = covariance.to_levels(points.channels)
     seen = points.offsets, levels, points.weights
     problem = ChannelProblem(*seen, image.rgbx, image.width, covariance.SCALE)
-    hessian = covariance.compute_hessian(problem, pose, covariance.STEPS[0].turn, 3.0)
+    hessian = covariance.compute_hessian(problem, pose, WHOLE.steps[0].turn, 3.0)
     for delta in ([0.001, 0, 0, 0, 0.003, 0], [0, -0.0015, 0.001, 0.003, 0, -0.004]):
         moved = step(pose, np.array(delta))
         before, after = _gradients(problem, (pose, moved), pose.center_world)
@@ -126,40 +126,45 @@ def test_in_a_place_ten_times_as_large_a_position_is_known_a_tenth_as_well(found
     prepared, pose, _ = found
     points = _points(prepared, pose)
     places = [points._replace(offsets=points.offsets * np.float32(size)) for size in (4.0, 40.0)]
-    small, large = (
-        covariance.compute_covariance(prepared.photo, place, pose, WHOLE, WORKERS) for place in places
-    )
+    small, large = (covariance.compute_covariance(prepared.photo, place, pose, WHOLE) for place in places)
     per_metre = np.repeat([1.0, 0.1], 3)
     np.testing.assert_allclose(large * np.outer(per_metre, per_metre), small, rtol=0.02, atol=1e-9)
 
 
 @pytest.mark.parametrize("num_rough", [0, 1, 2, 3])
-def test_where_the_finest_images_have_no_minimum_the_next_one_tells(num_rough):
+def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, num_rough):
     """Those that have one count alike."""
-    ways = (*covariance.STEPS, covariance.ROUGH_STEPS)
+    prepared, pose, _ = found
+    points = _points(prepared, pose)
+    ways = (*WHOLE.steps, WHOLE.rough_steps)
     assert [steps.image for steps in ways] == ["full", "fine", "middle"]
-    told = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    rough = [steps.image for steps in ways[:num_rough]]
     asked = []
 
-    def by(steps):
-        asked.append(steps)
-        return None if steps in ways[:num_rough] else steps.inflation * told
+    def image(name):
+        asked.append(name)
+        seen = prepared.photo.image(name)
+        return seen._replace(rgbx=np.zeros_like(seen.rgbx)) if name in rough else seen
 
-    matrix = covariance.merge_images(by, WHOLE, Workers(1))
-    assert asked == list(ways[: 2 if num_rough < 2 else 3])
+    def by(*steps):
+        profile = replace(WHOLE, steps=steps)
+        return covariance.compute_covariance(prepared.photo, points, pose, profile)
+
+    matrix = covariance.compute_covariance(SimpleNamespace(image=image), points, pose, WHOLE)
+    assert asked == ["full", "fine", "middle"][: 2 if num_rough < 2 else 3]
     if num_rough == 3:
         assert matrix is None
     else:
-        inflation = ways[num_rough].inflation if num_rough else 2.0 / (1.0 / 1.1 + 1.0 / 0.36)
-        np.testing.assert_allclose(matrix, inflation * told)
+        told = [by(steps) for steps in ways[num_rough : max(num_rough + 1, 2)]]
+        mean = np.linalg.inv(np.mean(np.linalg.inv(told), axis=0))
+        np.testing.assert_allclose(matrix, mean, rtol=1e-6, atol=1e-12)
 
 
 def test_a_part_of_the_sphere_has_few_blocks_that_tell(found):
     prepared, pose, _ = found
     points = _points(prepared, pose)
     whole, part = (
-        covariance.compute_covariance(prepared.photo, points, pose, profile, WORKERS)
-        for profile in (WHOLE, PARTIAL)
+        covariance.compute_covariance(prepared.photo, points, pose, profile) for profile in (WHOLE, PARTIAL)
     )
     num_blocks = len(covariance.sort_by_block(points)[1]) - 1
     np.testing.assert_allclose(part, covariance.few_blocks_factor(num_blocks) * whole, rtol=5e-3)

@@ -237,8 +237,7 @@ def test_heading_is_the_worlds_where_the_map_was_levelled(tilts):
 )
 def test_number_of_starts(num_candidates, most, expected):
     """One for every two candidates that are searched, but not fewer and not more than asked for."""
-    assert search.count_starts(num_candidates, most, False) == expected
-    assert search.count_starts(num_candidates, most, True) == most
+    assert search.thin_starts(num_candidates, most) == expected
 
 
 @pytest.mark.parametrize("most", [20, 150])

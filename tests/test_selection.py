@@ -8,7 +8,7 @@ import pytest
 import rooms
 from made_up import PARTIAL, PROBLEM, WHOLE, make_candidate, make_selection, place, places
 
-from piccolo.evidence.examine import count_agreeing, examine
+from piccolo.evidence.examine import complete, count_agreeing, examine
 from piccolo.geometry.pose import step
 from piccolo.jobs.threads import Workers
 from piccolo.judge.candidate import Selection
@@ -224,6 +224,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere():
 
     def judged(*candidates, rival_ratio=0.0, asked=problem):
         selection = make_selection(*candidates, rival_ratio=rival_ratio)
+        selection = complete(asked, selection, rooms.WORKERS)
         return judge(Found(asked, selection, None), rooms.means(), 0.9)
 
     found = judged(best, *others, rival_ratio=0.3)

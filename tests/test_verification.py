@@ -286,7 +286,8 @@ def test_the_scan_is_drawn_once_for_each_pose_of_the_grid():
         drawn = verification.draw_near(_problem(), other, known, WORKERS)
         key, drawn_at = verification.round_pose(other)
         assert drawn.key == key != known.key
-        expected = verification.match_drawn(_problem(), drawn_at, WORKERS)
+        picture = verification.find_all_drawn(_problem(), drawn_at, WORKERS)
+        expected = verification.match_located(_problem().photo.seen(WORKERS).keypoints, picture)
         np.testing.assert_array_equal(drawn.matches.points, expected.points)
 
 

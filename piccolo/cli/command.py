@@ -179,26 +179,25 @@ def command(
     epilog: str,
     add_options: Callable[[argparse.ArgumentParser], None],
     exit_codes: str = "0 done",
-    work: str = __name__,
-) -> Callable[[Callable[[Arguments], int]], Main]:
+) -> Callable[[Callable[[Arguments], int] | str], Main]:
     """Make a function of the options given, which returns an exit code, the `main` of a command.
 
-    The command is named after its source `file`; `exit_codes` are its own, below 2. The module `work` is
-    imported when the options are right.
+    The command is named after its source `file`; `exit_codes` are its own, below 2. A function that is named
+    as `module:function` is imported when the options are right: --help need not wait for it.
     """
 
-    def decorate(run: Callable[[Arguments], int]) -> Main:
+    def decorate(run: Callable[[Arguments], int] | str) -> Main:
         def main(argv: list[str] | None = None) -> int:
             parser = new_parser(Path(file).stem, description, epilog, exit_codes)
             add_options(parser)
             arguments = parse(parser, argv)
-            load(work)
+            work = import_function(run) if isinstance(run, str) else run
             lost: list[KeyboardInterrupt] = []
             try:
                 with showing_log(arguments.quiet), raising_signals(lost):
                     check_address_space()
                     warn_of_two_opencvs()
-                    exit_code = run(arguments)
+                    exit_code = work(arguments)
                     sys.stdout.flush()  # here, where a closed pipe is caught
                     return exit_code
             except (Exception, KeyboardInterrupt) as error:
@@ -207,6 +206,13 @@ def command(
         return main
 
     return decorate
+
+
+def import_function(name: str) -> Callable[[Arguments], int]:
+    """Import the function of a command that is named as `module:function`."""
+    module, _, function = name.partition(":")
+    found: Callable[[Arguments], int] = getattr(load(module), function)
+    return found
 
 
 def warn_of_two_opencvs() -> None:

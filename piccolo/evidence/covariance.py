@@ -1,8 +1,7 @@
 """Covariance of a pose from blocks of the sphere."""
 
 import math
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,7 @@ from ..panorama.texels import Texels
 from ..problem.photo_images import PhotoImages
 from ..problem.problem import Problem
 from ..problem.profile import Profile
-from ..problem.stages import LAST, ImageName
+from ..problem.stages import LAST
 from ..views.view import Cells
 from .comparison import mask_occluders
 from .contradictions import contradictions
@@ -40,7 +39,6 @@ UNCALIBRATED_SHARE = 0.15  # PIXEL_SHARE of a photo with unknown principal point
 LEAST_RANGE = 0.005 / math.radians(0.1)  # [m] for moves of differences: shorter ones are lost in noise
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
 TINY = 1e-12  # [rad^2, m^2] least variance of errors of one photo alone
-ALONE = 0.05  # chosen: of the variance by edges, the part that is not in common with other photos
 SCALE = LAST.limits.loss_scale * LEVELS_PER_UNIT
 # normals (9, 3), in the camera's frame, of planes between halves: the seam of two lenses may have any azimuth
 NORMALS = np.array([*(yaw_rotation(k * math.pi / 8.0)[0] for k in range(8)), (0.0, 0.0, 1.0)])
@@ -50,28 +48,6 @@ SEAMS = (0.25, 0.5, 0.75)  # of the points, on one side of a plane between parts
 SEAM_SCORE = 4.5  # of parts; single scans have more in a fifth of photos
 NUM_TRIED = 2  # planes
 HALF_LIMITS = (15, 1e-5)  # iterations of a half's descent, and tolerance [rad + m]
-
-
-class DifferenceSteps(NamedTuple):
-    """Image and step with which the loss is differentiated for a covariance."""
-
-    image: ImageName  # of the photo
-    turn: float  # [rad] step of the differences; a move is this times the median range
-    inflation: float  # so that 95 % of true poses lie in the 95 % region (tools/benchmark.py calibration)
-
-
-STEPS = (
-    DifferenceSteps("full", math.radians(0.1), 1.1),
-    DifferenceSteps("fine", math.radians(0.3), 0.36),
-)
-# of dark, noisy photos; they are too few to calibrate
-ROUGH_STEPS = DifferenceSteps("middle", math.radians(0.3), 1.0)
-# of edges, whose poses have larger errors
-SHAPE_STEPS = (
-    DifferenceSteps("full", math.radians(0.5), 1.0),
-    DifferenceSteps("fine", math.radians(0.5), 1.0),
-)
-ROUGH_SHAPE_STEPS = DifferenceSteps("fine", math.radians(0.8), 1.0)
 
 
 @kernel
@@ -285,9 +261,7 @@ def disagreement(photo: PhotoImages, points: Cells, pose: Pose, covariance: Arra
     return added
 
 
-def compute_covariance(
-    photo: PhotoImages, points: Cells, pose: Pose, profile: Profile, workers: Workers
-) -> Array | None:
+def compute_covariance(photo: PhotoImages, points: Cells, pose: Pose, profile: Profile) -> Array | None:
     """Return the covariance (6, 6) [rad, m] in the camera's frame.
 
     Noise and stitching roughen the loss in the finest image; the next one is smoother. Those that are not too
@@ -299,27 +273,18 @@ def compute_covariance(
         return None
     median_range = compute_median_range(points)
     points, begins = sort_by_block(points)
-
-    def by(steps: DifferenceSteps) -> Array | None:
+    found: list[Array] = []
+    for steps in (*profile.steps, profile.rough_steps):
+        if found and steps is profile.rough_steps:
+            return merge_covariances(found)
         problem = make_problem(points, photo.image(steps.image))
         hessian = compute_hessian(problem, pose, steps.turn, median_range)
         gradients = block_gradients(sum_by_block(problem, pose, begins))
         covariance = sandwich_covariance(hessian, gradients)
-        if covariance is None:
-            return None
-        factor = few_blocks_factor(len(gradients)) if profile.is_partial else 1.0
-        return steps.inflation * factor * covariance
-
-    return merge_images(by, profile, workers)
-
-
-def merge_images(
-    by: Callable[[DifferenceSteps], Array | None], profile: Profile, workers: Workers
-) -> Array | None:
-    """Merge the covariances by the finest images; if all are too rough, return that by the next one."""
-    steps = SHAPE_STEPS if profile.has_shape else STEPS
-    found = [c for c in workers.map(by, steps, "covariance") if c is not None]
-    return merge_covariances(found) if found else by(ROUGH_SHAPE_STEPS if profile.has_shape else ROUGH_STEPS)
+        if covariance is not None:
+            factor = few_blocks_factor(len(gradients)) if profile.has_few_blocks else 1.0
+            found.append(steps.inflation * factor * covariance)
+    return found[0] if found else None
 
 
 def split_errors(problem: Problem, pose: Pose, covariance: Array) -> PoseGaussian:
@@ -370,7 +335,7 @@ def estimate_covariance(
     """
     pose = candidate.pose
     profile = problem.profile
-    leaves_out = seen_from is not None and not profile.is_partial
+    leaves_out = seen_from is not None and not profile.settles_near
     masked = mask_occluders(problem, candidate.seen, candidate.unoccluded).photo
     if seen_from is None:
         points = problem.show(masked).view_at(pose, "points")
@@ -380,7 +345,7 @@ def estimate_covariance(
     if leaves_out and candidate.seen.contradicts.any():
         points = remove_hidden(points, masked.panorama.is_valid, pose)
     photo = problem.photo if leaves_out else masked
-    covariance = compute_covariance(photo, points, pose, profile, workers)
+    covariance = compute_covariance(photo, points, pose, profile)
     if covariance is None:
         return UNKNOWN_ERRORS
     turned = pose.R_cam_from_world.T  # R_map_from_cam
@@ -391,10 +356,9 @@ def estimate_covariance(
     of_grid = np.diag(np.repeat([turn**2, (turn * median_range) ** 2], 3))  # and of stitching, in all blocks
     own = turn_positions(covariance, turned) + of_grid
     common = scan_covariance(problem.scan_map, median_range)
-    if profile.has_shape:
-        own, common = ALONE * own, common + (1.0 - ALONE) * own
+    own, common = profile.own_share * own, common + (1.0 - profile.own_share) * own
     std_of_fit = largest_std(own + common)
-    if not (profile.is_partial or profile.has_shape):
+    if profile.compares_halves:
         own = own + turn_positions(disagreement(photo, points, pose, covariance, workers), turned)
     common = common + layer_covariance(problem.scan_map, pose, median_range)
     return Errors(PoseGaussian(pose, own, common), std_of_fit)

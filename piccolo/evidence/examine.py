@@ -8,7 +8,7 @@ from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..jobs.threads import Workers
 from ..judge.candidate import NO_CANDIDATE, Candidate, Selection
-from ..judge.selection import list_drawn, rank, select
+from ..judge.selection import list_drawn, select
 from ..problem.problem import Problem
 from ..problem.profile import DRAWN_VIEW
 from .comparison import compare
@@ -85,8 +85,3 @@ def choose(problem: Problem, found: Selection, workers: Workers) -> Selection:
     """
     chosen = select(problem.profile, complete(problem, found, workers))
     return complete(problem, chosen, workers)
-
-
-def choose_among(problem: Problem, candidates: Sequence[Candidate], workers: Workers) -> Selection:
-    """Choose the best of candidates, and the best ones elsewhere."""
-    return choose(problem, rank(candidates), workers)

@@ -38,10 +38,11 @@ def measure(problem: Problem, found: Selection, fit: Fit | None, workers: Worker
 
     measures: list[Callable[[], Any]] = [
         partial(estimate_errors, problem, found.best, workers),  # takes longest
-        lambda: compare_occlusion(points, problem.given, pose).fractions(),
-        lambda: measure_agreement(coarse, problem.photo.panorama, pose),
+        partial(compare_occlusion, points, problem.given, pose),
+        partial(measure_agreement, coarse, problem.photo.panorama, pose),
     ]
-    errors, fractions, agreement = workers.map(operator.call, measures, "evaluate")
+    errors, occlusion, agreement = workers.map(operator.call, measures, "evaluate")
+    explained, contradicted = occlusion.fractions()
     end = errors.gaussian.pose if errors.gaussian else pose
     loss = sampling_loss(visible_points(points, end.center_world), problem.colors(), end)
     if not math.isfinite(loss):
@@ -52,8 +53,8 @@ def measure(problem: Problem, found: Selection, fit: Fit | None, workers: Worker
         score=found.best.score,
         margin=found.margin,
         agreement=agreement.value,
-        explained_fraction=fractions[0],
-        contradicted_fraction=fractions[1],
+        explained_fraction=explained,
+        contradicted_fraction=contradicted,
         seen_fraction=agreement.seen_fraction,
         num_matches=num_matches[0] if uses_matches else None,
         alternative_matches=max(num_matches[1:], default=0) if uses_matches else None,

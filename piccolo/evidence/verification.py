@@ -97,7 +97,8 @@ def draw_near(problem: Problem, pose: Pose, known: Drawn | None, workers: Worker
     key, drawn_at = round_pose(pose)
     if known is not None and known.key == key:
         return known
-    return Drawn(key, match_drawn(problem, drawn_at, workers))
+    picture = find_all_drawn(problem, drawn_at, workers)
+    return Drawn(key, match_located(problem.photo.seen(workers).keypoints, picture))
 
 
 def round_pose(pose: Pose) -> tuple[bytes, Pose]:
@@ -106,11 +107,6 @@ def round_pose(pose: Pose) -> tuple[bytes, Pose]:
     turn = np.rint(log_so3(pose.R_cam_from_world) / TURN)
     key = np.concatenate([place, turn]).astype(np.int64).tobytes()
     return key, Pose(exp_so3(turn * TURN), place * PLACE)
-
-
-def match_drawn(problem: Problem, pose: Pose, workers: Workers) -> Matches:
-    """Draw the scan at a pose in the map, and match the photo's features with those of the picture."""
-    return match_located(problem.photo.seen(workers).keypoints, find_all_drawn(problem, pose, workers))
 
 
 def find_all_drawn(problem: Problem, pose: Pose, workers: Workers) -> Located:

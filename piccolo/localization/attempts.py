@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..evidence.examine import check_prior, choose, choose_among, examine
+from ..evidence.examine import check_prior, choose, examine
 from ..evidence.verification import Verified, draw_near, verify
 from ..geometry.pose import Pose
 from ..jobs.threads import Once, Workers
@@ -23,13 +23,13 @@ from ..local_features.keypoints import Keypoints, join_keypoints
 from ..local_features.matching import Matches, join_matches
 from ..photo import NOTHING_KNOWN
 from ..problem.problem import Problem
-from ..problem.profile import Beam
+from ..problem.profile import Beam, Tilts
 from ..problem.settings import Effort
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
 from .beam import refine_matches, refine_starts, score_mirror, score_starts
 from .means import Means
-from .search import Tilts, search_poses
+from .search import search_poses
 
 FIRST_MIRROR_RATIO = 1.1  # least ratio of first scores, photo to mirrored photo
 FIRST_BEAM = Beam(100, 12, 4, 1)
@@ -72,9 +72,9 @@ def plan_attempts(problem: Problem) -> list[tuple[Problem, Attempt]]:
     ]
     by_views: list[tuple[Problem, Attempt]] = []
     asked = problem.without_map_features() if looks_first else problem
-    is_partial = problem.profile.is_partial
-    if is_partial or problem.gravity != "unknown":
-        upright: Tilts = "level" if is_partial and not problem.photo.has_tilt else "known"
+    profile = problem.profile
+    if profile.is_always_upright or problem.gravity != "unknown":
+        upright: Tilts = "known" if problem.photo.has_tilt else profile.untold_tilt
         by_views.append((asked, partial(search_views, tilts=upright)))
     if problem.gravity != "known":
         by_views.append((asked, partial(search_views, tilts="any", is_brief=looks_first)))
@@ -90,7 +90,7 @@ def look_first(problem: Problem, known: list[Candidate], means: Means) -> tuple[
             starts = search_poses(problem, "known", effort.brief(), workers)
         with watch.stage("refine"):
             found = known + refine_starts(problem, starts, FIRST_BEAM, workers)
-            if not is_clear(problem.profile, choose_among(problem, found, workers)):
+            if not is_clear(problem.profile, choose(problem, rank(found), workers)):
                 return found, False
             return found, beats_mirror(score_starts(problem, starts, workers), of_mirror())
 
@@ -111,7 +111,7 @@ def look_along_walls(problem: Problem, known: list[Candidate], means: Means) -> 
     refined = search_and_refine(problem, "known", FIRST_BEAM, means)
     with means.watch.stage("refine"):
         found = known + refined
-        return found, is_clear(problem.profile, choose_among(problem, found, means.workers))
+        return found, is_clear(problem.profile, choose(problem, rank(found), means.workers))
 
 
 def search_part(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
@@ -172,8 +172,8 @@ def search_and_refine(problem: Problem, tilts: Tilts, beam: Beam, means: Means) 
 
 
 def add_verified(problem: Problem, candidates: list[Candidate], workers: Workers) -> list[Candidate]:
-    """Verify the candidates of a photo of a part of the sphere; add poses refined on many matches."""
-    if not problem.profile.is_partial or not candidates:
+    """Verify candidates, if the profile says so; add poses refined on many matches."""
+    if not problem.profile.refines_on_matches or not candidates:
         return candidates
 
     def verify_one(candidate: Candidate) -> tuple[Candidate, Verified]:
@@ -204,7 +204,8 @@ def match_poses(problem: Problem, means: Means) -> tuple[list[Pose], Matches]:
     if problem.scan_map.awaits_features:
         with means.watch.stage("prepare"):
             problem.scan_map.features_now(workers)
-    is_level = problem.gravity == "known" and (problem.photo.has_tilt or not problem.profile.is_partial)
+    has_exact_tilt = problem.photo.has_tilt or problem.profile.untold_tilt == "known"
+    is_level = problem.gravity == "known" and has_exact_tilt
     up_cam = problem.photo.R_cam_from_level[:, 2]
     with means.watch.stage("match"):
         matches = join_features(problem, workers)[1]
@@ -222,7 +223,7 @@ def join_features(problem: Problem, workers: Workers) -> tuple[Keypoints, Matche
 
 def can_look_first(problem: Problem) -> bool:
     """Return True if the photo shows nearly the whole sphere, and its tilt may be the known one."""
-    return problem.gravity != "unknown" and not problem.profile.is_partial
+    return problem.gravity != "unknown" and problem.profile.looks_first
 
 
 def thin_out(problem: Problem) -> Problem:

@@ -52,10 +52,10 @@ def refine_starts(problem: Problem, starts: Starts, beam: Beam, workers: Workers
     coarse = keep_ends(descend_prepared(problem, starts, problem.profile.first, workers), beam.num_coarse)
     coarse = keep_ends(descend_prepared(problem, coarse, SECOND, workers), beam.num_middle)
     descend = partial(refine, problem, workers=workers)
-    middle = workers.map(partial(descend, first=MIDDLE), coarse.poses(), "descend")
+    middle = workers.map(partial(descend, stage=MIDDLE), coarse.poses(), "descend")
     narrowed = narrow(middle, beam.num_fine)
-    perturbed = workers.map(partial(descend, first=AROUND_MIDDLE), narrowed, "descend")
-    fine = workers.map(partial(descend, first=FINE), narrow(perturbed, beam.num_fine), "descend")
+    perturbed = workers.map(partial(descend, stage=AROUND_MIDDLE), narrowed, "descend")
+    fine = workers.map(partial(descend, stage=FINE), narrow(perturbed, beam.num_fine), "descend")
     best = [end.pose for end in best_distinct(fine, beam.num_perturbed, DESCENDED)]
     ends = workers.map(partial(climb, problem, workers=workers), best, "descend")
     kept = keep_comparable(keep_distinct([*ends, *fine], middle))

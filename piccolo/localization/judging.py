@@ -30,7 +30,7 @@ WORTH_ASKING = 0.2  # least probability of all poses together, for which the mir
 
 
 class Found(NamedTuple):
-    """The poses found for a photo, refined."""
+    """The poses found for a photo, refined, with all evidence by which they are chosen."""
 
     problem: Problem
     selection: Selection
@@ -48,7 +48,6 @@ def judge(found: Found, means: Means, min_confidence: float, may_promote: bool =
     """
     problem, selection, fit = found
     workers = means.workers
-    selection = complete(problem, selection, workers)
     measured = measure(problem, selection, fit, workers)
     if measured is None:
         return Localization()

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from ..panorama.local_normalization import LEVELS_PER_UNIT, to_levels
 from ..panorama.texels import Texels
 from ..problem.problem import Problem
 from ..problem.profile import VIEWS
-from ..problem.stages import AROUND_FINE, AROUND_MIDDLE, FINE, FULL, LAST, MIDDLE, SOFT, Limits, Stage
+from ..problem.stages import AROUND_FINE, AROUND_MIDDLE, FINE, FULL, LAST, MIDDLE, Limits, Stage
 from ..views.points_around import PLACE_SPACING
 from ..views.view import Cells
 
@@ -33,19 +34,15 @@ MAX_UNOCCLUDED = 2  # rounds that mask occluders
 MIN_SCORE_LEFT = 0.9  # fraction of the score that a descent on points must keep
 
 
-def refine(
-    problem: Problem, start: Pose, workers: Workers, first: Stage, then: Stage | None = None
-) -> Hypothesis:
-    """Descend from a pose through one or two stages, each on what is seen from where it begins.
+def refine(problem: Problem, start: Pose, workers: Workers, stage: Stage) -> Hypothesis:
+    """Descend from a pose through a stage, on what is seen from there.
 
-    The score of the end is that on the cells of the last view; nan on points.
+    The score of the end is that on the cells of the view; nan on points.
     """
-    cells = problem.view_at(start, first.view)
-    if first.around is None:
-        end = descend_on(problem, cells, start, first)
-    else:
-        end = descend_around(problem, cells, start, first, workers)
-    return end if then is None else refine(problem, end.pose, workers, then)
+    cells = problem.view_at(start, stage.view)
+    if stage.around is None:
+        return descend_on(problem, cells, start, stage)
+    return descend_around(problem, cells, start, stage, workers)
 
 
 def descend_on(problem: Problem, cells: Cells, pose: Pose, stage: Stage) -> Hypothesis:
@@ -135,7 +132,8 @@ def climb_masked(problem: Problem, start: Candidate, workers: Workers) -> Candid
     """Climb from a candidate, and from poses around it, with the photo that is masked there."""
     assert start.unoccluded is not None
     masked = problem.show(start.unoccluded.photo)
-    first = refine(masked, start.pose, workers, AROUND_MIDDLE, FINE)
+    around = refine(masked, start.pose, workers, AROUND_MIDDLE)
+    first = refine(masked, around.pose, workers, FINE)
     return examine(problem, climb(masked, first.pose, workers).pose, start)
 
 
@@ -160,9 +158,8 @@ def converge(problem: Problem, found: Candidate, stage: Stage, workers: Workers)
     pose = found.pose
     for k in range(stage.rounds.most):
         center = pose.center_world
-        is_soft = k == 0 and problem.profile.has_shape
-        stages = (SOFT, stage) if is_soft else (stage,)
-        pose = refine(shown, pose, workers, *stages).pose
+        for each in (*problem.profile.soft, stage) if k == 0 else (stage,):
+            pose = descend_on(shown, shown.view_at(pose, each.view), pose, each).pose
         if math.dist(pose.center_world, center) < stage.rounds.arrived:
             break
     end = examine(problem, pose, found)
@@ -184,14 +181,16 @@ def descend_perturbed(
     R_cam_from_map: Array,
     center: Array,
     scores: Array,
+    begin: int,
 ) -> None:
     """Perturb poses (n, 3, 3), (n, 3) by steps (n, 6) and descend in place, on the coarse then fine image.
 
-    `num_iterations` are those on each image. A pose with the zero step skips the coarse one.
+    These are PERTURBED_BATCH poses from `begin` on. `num_iterations` are those on each image. A pose with the
+    zero step skips the coarse one.
     """
     R = R_cam_from_map
     t = center
-    for k in range(len(steps)):
+    for k in range(begin, min(begin + PERTURBED_BATCH, len(steps))):
         retract(R[k].copy(), t[k].copy(), steps[k], R[k], t[k])
         first = 1
         for i in range(6):
@@ -246,24 +245,22 @@ def descend_around(problem: Problem, cells: Cells, pose: Pose, stage: Stage, wor
     scale = limits.loss_scale * LEVELS_PER_UNIT
     num_iterations = (stage.around.num_iterations, limits.num_iterations)
 
-    def run(lo: int) -> None:
-        part = slice(lo, lo + PERTURBED_BATCH)
-        descend_perturbed(
-            cells.offsets,
-            levels,
-            cells.weights,
-            blocks,
-            coarse,
-            fine,
-            scale,
-            limits.tolerance,
-            num_iterations,
-            steps[part],
-            R[part],
-            t[part],
-            scores[part],
-        )
-
-    workers.map(run, range(0, len(steps), PERTURBED_BATCH), "descend")
+    descend_from = partial(
+        descend_perturbed,
+        cells.offsets,
+        levels,
+        cells.weights,
+        blocks,
+        coarse,
+        fine,
+        scale,
+        limits.tolerance,
+        num_iterations,
+        steps,
+        R,
+        t,
+        scores,
+    )
+    workers.map(descend_from, range(0, len(steps), PERTURBED_BATCH), "descend")
     best = int(np.argmax(scores))
     return Hypothesis(Pose(orthonormal(R[best]), t[best] + cells.center_map), float(scores[best]))

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
-from ..evidence.examine import choose, choose_among, complete
+from ..evidence.examine import choose, complete
 from ..jobs.threads import Workers
 from ..judge.candidate import Candidate, Selection
 from ..judge.selection import SURE_MATCHES, count_matches, is_faint, rank
@@ -26,7 +26,7 @@ def refine_best(problem: Problem, candidates: Sequence[Candidate], workers: Work
         return found
     if is_faint(problem.profile, found):
         best = climb_unoccluded(problem, found.best, workers)
-        found = choose_among(problem, [best, *found.alternatives], workers)
+        found = choose(problem, rank([best, *found.alternatives]), workers)
         if is_faint(problem.profile, found):
             return found
     near, far = part_near(found, count_matches(problem.profile, found.candidates)[1:])
@@ -34,7 +34,7 @@ def refine_best(problem: Problem, candidates: Sequence[Candidate], workers: Work
         best = climb_unoccluded(problem, found.best, workers)
         return settle_best(problem, rank([best, *found.alternatives]), workers)
     refined = workers.map(partial(climb_to_full, problem, workers=workers), [found.best, *near], "descend")
-    return settle_best(problem, choose_among(problem, [*refined, *far], workers), workers)
+    return settle_best(problem, choose(problem, rank([*refined, *far]), workers), workers)
 
 
 def part_near(found: Selection, counts: Sequence[int]) -> tuple[list[Candidate], list[Candidate]]:

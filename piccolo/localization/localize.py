@@ -47,7 +47,7 @@ def localize(
         return explain_nothing(scan_map, panorama, settings.prior)
     with means.watch.stage("search"):
         problem.photo.images.search()  # each search begins with it
-    search = find_by_edges if problem.profile.has_shape else find
+    search = find_by_edges if problem.profile.follows_walls else find
     found = search(problem, scan_map, means)
     with means.watch.stage("refine"):
         return judge(found, means, settings.min_confidence)
@@ -145,7 +145,7 @@ def fit_camera(problem: Problem, found: Selection, means: Means) -> Found:
         return Found(problem, found, None)
     if problem.given.focal_prior is not None:
         return Found(*calibrate(problem, found, means.workers))
-    if problem.given.cameras or problem.profile.has_shape:
+    if problem.given.cameras or not problem.profile.fits_sphere:
         return Found(problem, found, None)
     return Found(*calibrate_sphere(problem, found, means.workers))
 

@@ -39,7 +39,7 @@ def refine_near(problem: Problem, start: Pose, workers: Workers) -> Near:
     pose = refine(problem, middle, workers, FULL).pose
     seen = compare(problem, pose, seen_from=seen_from if pose.distance(seen_from) < NEARLY else pose)
     end = Candidate(pose, seen.score, seen, contradictions(problem.scan_map, pose, problem.prior))
-    if problem.profile.is_partial:
+    if problem.profile.settles_near:
         end = settle(problem, end, workers)
     errors = UNKNOWN_ERRORS
     if end.score >= HOPELESS_SCORE:

@@ -1,12 +1,11 @@
 """Score every candidate position with every rotation, and keep the distinct best."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from ..arrays import Array, Int32s, Int64s
-from ..geometry.nearness import STARTING, STARTING_NARROW, non_maximum_suppression
+from ..geometry.nearness import non_maximum_suppression
 from ..geometry.pose import Pose, R_cam_from_angles, uniform_rotations, uniform_yaws
 from ..geometry.sphere import SEARCH_RINGS, make_grid, whole_areas, wider_cells
 from ..jobs.memory import check_memory
@@ -16,6 +15,7 @@ from ..panorama.local_normalization import sample_channels
 from ..panorama.texels import Texels
 from ..problem.prior import allow_rotations
 from ..problem.problem import Problem
+from ..problem.profile import Tilts
 from ..problem.settings import Effort
 from ..scan_map.scan_map import ScanMap
 from ..views.candidate_views import WIDE_RINGS
@@ -24,10 +24,9 @@ from .correlation import BLOCK, Samples, correlate_pairs, masked_correlation, we
 ROTATIONS_AT_ONCE = 256  # that a thread averages
 SCORES_AT_ONCE = 1 << 23  # 32 MB
 LOWEST = np.float32(-np.inf)
-Tilts = Literal["known", "level", "any"]  # of the camera that are searched: its own, about level, all
 TURNED_BYTES = 4 * 16  # of a rotation, a cell: channels, validity, energy, and what they are made from
 CANDIDATES_PER_START = 2
-MIN_STARTS = 1000  # of a whole photo
+MIN_STARTS = 1000
 POSES_PER_START = 12
 PITCHES_DEG = (-27.0, -18.0, -9.0, 0.0, 9.0, 18.0, 27.0)  # of a camera held about level
 NUM_LEVEL_YAWS = 40
@@ -178,7 +177,7 @@ def search_poses(problem: Problem, tilts: Tilts, effort: Effort, workers: Worker
     """Search the sparse candidates with all rotations in two stages; return the distinct best.
 
     The first scores wide cells of all, by matrix products, the second the search grid's cells of the best
-    poses. A photo of a part of the sphere has only the first, with the means subtracted.
+    poses. Profiles may do without it: the means are subtracted in the first then.
     """
     m = problem.scan_map
     rotations = list_rotations(problem, tilts, effort)
@@ -187,17 +186,17 @@ def search_poses(problem: Problem, tilts: Tilts, effort: Effort, workers: Worker
     task = f"a search of {len(m.sparse)} positions in {len(rotations)} rotations"
     check_memory(num_bytes, task, "set fewer num_yaws or num_rotations")
     samples, validity = turn_panorama(problem.photo.images.search(), rotations)
-    is_partial = problem.profile.is_partial
-    num_starts = count_starts(len(m.sparse), effort.max_starts, is_partial)
+    profile = problem.profile
+    most = effort.max_starts
+    num_starts = thin_starts(len(m.sparse), most) if profile.thins_starts else most
     pool = num_starts * POSES_PER_START
-    sparse, turn, _ = best_poses_wide(m, samples, validity, pool, num_views, workers, is_partial)
+    sparse, turn, _ = best_poses_wide(m, samples, validity, pool, num_views, workers, profile.subtracts_means)
     candidate = m.sparse[sparse]
     R = rotations[turn]
     centers = m.centers[candidate]
-    near = STARTING_NARROW if is_partial else STARTING
-    kept = non_maximum_suppression(R, centers, num_starts, near)
+    kept = non_maximum_suppression(R, centers, num_starts, profile.starts_apart)
     candidate = candidate[kept]
-    if is_partial:
+    if not profile.scores_again:
         return Starts(R[kept], centers[kept], candidate)
     scores = np.empty(len(kept), np.float32)
     used, row_of_turn = np.unique(turn[kept], return_inverse=True)
@@ -209,9 +208,9 @@ def search_poses(problem: Problem, tilts: Tilts, effort: Effort, workers: Worker
     return Starts(R[kept][order], centers[kept][order], candidate[order])
 
 
-def count_starts(num_candidates: int, most: int, is_partial: bool) -> int:
-    """Return from how many poses descents begin: for a whole photo fewer, where there are few candidates."""
-    return most if is_partial else min(max(num_candidates // CANDIDATES_PER_START, MIN_STARTS), most)
+def thin_starts(num_candidates: int, most: int) -> int:
+    """Return from how many poses descents begin, where there are few candidates from fewer."""
+    return min(max(num_candidates // CANDIDATES_PER_START, MIN_STARTS), most)
 
 
 def list_rotations(problem: Problem, tilts: Tilts, effort: Effort) -> Array:

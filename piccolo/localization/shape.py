@@ -15,7 +15,7 @@ from ..judge.candidate import Candidate, Selection
 from ..judge.selection import CLEAR_MARGIN
 from ..panorama.gpano import attitude_of_gravity
 from ..problem.problem import Problem, prepare_problem
-from ..problem.profile import CLEAR_SHAPE, choose_profile
+from ..problem.profile import choose_profile
 from ..problem.settings import Effort
 from ..views.points_around import round_position
 from .attempts import FIRST_BEAM
@@ -38,7 +38,7 @@ def is_tilt_known(problem: Problem) -> bool:
 def is_explained(found: Selection, searched: Problem) -> bool:
     """Return True if a pose explains a photo by its edges: one alone, unless lines lie along the walls."""
     is_alone = found.margin > CLEAR_MARGIN or searched.rotations is not None
-    return found.best.score > CLEAR_SHAPE and is_alone
+    return found.best.score > searched.profile.clear_score and is_alone
 
 
 def align_lines(yaw_of_walls: float | None, axes: Sequence[Array], R_cam_from_level: Array) -> Array | None:

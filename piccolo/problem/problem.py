@@ -104,10 +104,10 @@ class Problem:
         config = VIEWS[name]
         place = round_position(pose)
         shown = self.photo.find_shown_cells(config.num_rings, pose)
+        cone = self.photo.find_cone(config.num_rings, pose)
         if name == "points":
-            cone = self.photo.find_cone(config.num_rings, pose)
             return self.views.points(place, config, shown.tobytes(), cone, NUM_POINTS)
-        return normalize_view(self.averages_at(pose, place, config), place, config, shown)
+        return normalize_view(self.views.averages(place, config, cone), place, config, shown)
 
     def averages_at(self, pose: Pose, place: Place, config: ViewConfig) -> Array32:
         """Return the sums (cells, 8) of a view from a place near a pose, of what the photo shows."""

@@ -195,7 +195,7 @@ def find_support(
 def list_near(problem: Problem, expected: Pose, workers: Workers) -> list[Candidate]:
     """Return a photo's poses near the one expected: by whole views, by matches, and that itself."""
     poses = [refine(problem, expected, workers, FINE).pose]
-    if problem.profile.is_partial:
+    if problem.profile.refines_on_matches:
         drawn = draw_near(problem, expected, None, workers).matches
         poses.append(verify(problem, expected, drawn).pose)
     near = [pose for pose in poses if ONE_IN_BUNDLE.holds(pose, expected)]

@@ -80,7 +80,7 @@ def find_alone(
         problem = prepare_search(scan_map, photo, settings, means.watch)
         if problem is None:
             return None
-        search = find_by_edges if problem.profile.has_shape else find
+        search = find_by_edges if problem.profile.follows_walls else find
         ended = search(problem, scan_map, means)
         judged = judge(ended, means, settings.min_confidence, may_promote=False)
         found.append(Member(ended.forget(), judged))
