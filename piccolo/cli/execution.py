@@ -22,8 +22,8 @@ from ..jobs.processes import Here, Processes, WorkerLostError
 from ..jobs.threads import num_cores
 from ..judge.probability import AMBIGUOUS, LOCALIZED
 from ..judge.sure import WORTH_A_LOOK
-from ..opened_scan import OpenedScan
 from ..result import FAILED, UNREADABLE, Result
+from ..scan import Scan
 from ..scan_map.map_file import save_map
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.scan_map import ScanMap
@@ -125,7 +125,7 @@ def executing(
     localizer: Localizer,
     num_jobs: int,
     cluster: Cluster | None,
-    open_scan: Callable[[Localizer, int], OpenedScan],
+    open_scan: Callable[[Localizer, int], Scan],
 ) -> Iterator[tuple[Executor, Localizer]]:
     """Yield an executor, and the localizer for it; `open_scan` prepares the scan, with so many threads."""
     is_kept = localizer.cache.is_used
@@ -149,7 +149,7 @@ def executing(
 
 
 def at_the_workers(
-    arguments: Arguments, cluster: Cluster, localizer: Localizer, scan: OpenedScan, is_kept: bool
+    arguments: Arguments, cluster: Cluster, localizer: Localizer, scan: Scan, is_kept: bool
 ) -> Localizer:
     """Return a localizer whose scan a cluster's workers can open: at its path, or sent to them."""
     here = Path.cwd()

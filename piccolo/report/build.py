@@ -296,9 +296,8 @@ def write_report(
     check_kind("scan", scan, Scan)
     check_kind("out", out, File)
     check_kind("settings", settings, ReportSettings)
-    opened = scan._opened
-    if not isinstance(opened.prepared, ScanMap):
+    if not isinstance(scan.prepared, ScanMap):
         raise InputError("write_report: found a scan of the preset paper, wanted one of the default method")
     several = [results] if isinstance(results, str | PathLike) else results
     entries = site.collect_entries([item if isinstance(item, Result) else Path(item) for item in several])
-    return build_report(entries, opened.prepared, Path(out), settings, opened.workers).page
+    return build_report(entries, scan.prepared, Path(out), settings, scan.workers).page
