@@ -1,21 +1,22 @@
 """Photos as they are read for a scan: pictures, facts, and the results that they begin with."""
 
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
 from .cloud.settings import CloudSettings, from_wgs84
-from .errors import is_passing
+from .errors import InputError, is_passing, text_of
 from .files.json_file import reading_once
+from .jobs.memory import is_shortage
 from .jobs.threads import Stopwatch
-from .judge.localization import FocalLength
-from .judge.probability import NOT_LOCALIZED
+from .judge.result import FAILED, UNREADABLE, Result
+from .judge.result_parts import FocalLength, Source
 from .panorama import Panorama, check_labels, read_panorama
 from .panorama.photo import PhotoFacts, read_photo_facts, sha256_of
 from .paper.localize import PaperSettings
 from .photo import GpsPrior, Photo, Prior
 from .problem.settings import CoarseToFineSettings
-from .result import Result, Source, describe_failure, unreadable_result
 
 LABELS_WARNING = "`labels`: the confidence was fitted to colours; with labels it is a rough estimate"
 Settings = CoarseToFineSettings | PaperSettings
@@ -60,10 +61,8 @@ class PhotoReader:
         """Return the result of a photo that is not localized yet."""
         has_labels = self.cloud_settings.labels is not None
         return Result(
-            NOT_LOCALIZED,
-            0.0,
-            self.scan,
-            photo.name,
+            cloud=self.scan,
+            pano=photo.name,
             seconds=seconds,
             settings=settings_json(settings, self.cloud_settings, photo),
             warnings=self.warnings + picture.warnings + ((LABELS_WARNING,) if has_labels else ()),
@@ -99,3 +98,20 @@ def settings_json(settings: Settings, cloud_settings: CloudSettings, photo: Phot
     labels = cloud_settings.labels and asdict(cloud_settings.labels)
     reading = {**photo.to_json(), "labels": labels}
     return {**settings.to_json(), "cloud": asdict(cloud_settings), "panorama": reading}
+
+
+def describe_failure(error: Exception) -> str:
+    """Return in one line why a photo has no result; an error of none, but of the program, is raised."""
+    if isinstance(error, OSError | InputError):
+        return text_of(error)
+    if is_shortage(error):
+        return f"not enough memory ({' '.join(str(error).split()) or 'none is left'})"
+    raise error
+
+
+def unreadable_result(
+    error: str, cloud: str | tuple[str, ...], pano: str, is_passing: bool = False, **more: Any
+) -> Result:
+    """Return the result of a photo that can't be read, or could not at the moment; `more` as in Result."""
+    status = FAILED if is_passing else UNREADABLE
+    return Result(status, 0.0, cloud, pano, error=error, **more)

@@ -6,9 +6,9 @@ from typing import Any
 
 from .camera import Calibration
 from .geometry.colors import Labels
+from .judge.result import Result
 from .panorama import Panorama, read_panorama
 from .photo import Photo
-from .result import Result
 
 
 def photo_of(result: Result, path: Path | None = None) -> Photo:

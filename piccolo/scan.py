@@ -16,8 +16,9 @@ from .files.atomic import check_output
 from .geometry.pose import Gravity, Pose, check_pose
 from .jobs.memory import check_memory
 from .jobs.threads import Stopwatch, Workers
-from .judge.localization import FocalLength, Localization
 from .judge.probability import LOCALIZED
+from .judge.result import Result, nothing_found
+from .judge.result_parts import FocalLength
 from .localization.localize import has_guessed_focal, localize, localize_guessed
 from .localization.means import NO_TRACE, Means, Trace
 from .localization.places import add_places
@@ -25,7 +26,6 @@ from .paper.localize import PaperMap, PaperSettings, localize as localize_by_pap
 from .photo import File, Photo, Prior, as_photo
 from .photo_reader import PhotoReader, Settings
 from .problem.settings import CoarseToFineSettings
-from .result import Result, with_localization
 from .scan_map.open_map import write_map
 from .scan_map.scan_map import ScanMap, check_within
 from .scan_walk import Walk
@@ -152,7 +152,7 @@ class Scan:
             gps = reader.make_gps_prior(facts, settings.prior)
             run = localize_guessed if has_guessed_focal(picture) else localize
             means = Means(settings.effort, self.workers, watch, trace)
-            found = Localization()
+            found = nothing_found()
             if gps is not None:
                 near = replace(settings, prior=gps.apply_to(settings.prior))
                 found = run(self.prepared, picture, near, means)
@@ -163,7 +163,7 @@ class Scan:
         if focal is not None:
             found = replace(found, focal_length=focal.update(found.focal_length))
         blank = reader.make_blank(photo, picture, facts, settings, watch.seconds)
-        return replace(with_localization(blank, found), gps_prior=gps)
+        return replace(found.complete(blank), gps_prior=gps)
 
     def localize_many(
         self,
@@ -239,9 +239,7 @@ class Scan:
         found = localize_bundle(scan_map, pictures, poses, settings, self.workers, watch, errors)
         seconds = {stage: spent / len(found) for stage, spent in watch.seconds.items()}
         return [
-            with_localization(
-                reader.make_blank(photo, picture, facts, settings, seconds), add_places(scan_map, one)
-            )
+            add_places(scan_map, one).complete(reader.make_blank(photo, picture, facts, settings, seconds))
             for photo, (picture, facts), one in zip(given, taken, found, strict=True)
         ]
 

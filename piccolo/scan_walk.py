@@ -13,17 +13,17 @@ from .errors import InputError
 from .files.json_file import reading_once
 from .geometry.pose import Pose, check_pose
 from .jobs.threads import Progress, Stopwatch, no_progress
-from .judge.localization import Localization
+from .judge.result import Result
+from .judge.result_parts import WalkFrame
 from .localization.places import add_places
 from .panorama import Panorama
 from .panorama.photo import read_photo_facts, sha256_of
 from .photo import File, Photo, as_photo
 from .photo_reader import PhotoReader, settings_json
 from .problem.problem import Problem
-from .result import Result, with_localization
 from .together.walk.frames import Frame, check_times
 from .together.walk.path import believe
-from .together.walk.results import WalkFrame, describe_frame, make_localization, make_localizations
+from .together.walk.results import describe_frame, make_localization, make_localizations
 from .together.walk.tracker import Tracker
 
 NO_REFINING = "`refine_focal`: not an option of walks; refine the focal length with a single photo"
@@ -154,12 +154,10 @@ class Walk:
         found = make_localizations(self.tracker, show)
         return [self._result(blank, *parts) for blank, parts in zip(self.blanks, found, strict=True)]
 
-    def _result(self, blank: Result, found: Localization, walk: WalkFrame) -> Result:
+    def _result(self, blank: Result, found: Result, walk: WalkFrame) -> Result:
         """Return the result of a frame; a frame that can't be read keeps its place in the walk."""
-        result = replace(blank, walk=walk)
-        if blank.error is not None:
-            return result
-        return with_localization(result, add_places(self.tracker.scan_map, found))
+        blank = replace(blank, walk=walk)
+        return blank if blank.error else add_places(self.tracker.scan_map, found).complete(blank)
 
     def _read(self, photo: Photo, name: str) -> Panorama:
         """Read a photo, which warnings call by its name; its focal length counts as exact."""

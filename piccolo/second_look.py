@@ -6,6 +6,7 @@ from dataclasses import replace
 from .files.json_file import reading_once
 from .geometry.nearness import CONFIRMED
 from .jobs.threads import Stopwatch, Workers
+from .judge.result import Result
 from .localization.localize import has_guessed_focal
 from .localization.places import add_places
 from .panorama.photo import read_photo_facts
@@ -13,7 +14,6 @@ from .photo import Photo
 from .photo_reader import PhotoReader
 from .problem.problem import prepare_problem
 from .problem.settings import CoarseToFineSettings
-from .result import Result, with_localization
 from .scan_map.scan_map import ScanMap
 from .together.beside import SurePhoto, localize_beside, place_sure
 
@@ -61,7 +61,7 @@ def localize_again(
         pictures = list_pictures()
     found, names = localize_beside(scan_map, picture, poses, pictures, settings, workers, watch)
     is_surer = found.confidence > first.confidence
-    is_other = first.best_pose and found.pose and not CONFIRMED.holds(found.pose, first.best_pose)
+    is_other = first.best_pose and found.best_pose and not CONFIRMED.holds(found.best_pose, first.best_pose)
     if not names or not (is_surer or is_other):
         return first, ()
     if focal is not None:
@@ -70,5 +70,5 @@ def localize_again(
         alone = replace(found.focal_length, picture_px=None, picture_std_px=None)
         found = replace(found, focal_length=alone)
     blank = reader.make_blank(photo, picture, facts, settings, watch.seconds)
-    found = add_places(scan_map, found)
-    return replace(with_localization(blank, found), gps_prior=first.gps_prior), names
+    found = add_places(scan_map, found).complete(blank)
+    return replace(found, gps_prior=first.gps_prior), names

@@ -16,6 +16,7 @@ import pytest
 import rooms
 from batches import untimed
 from pictures import encoded, write
+from poses import judged
 from test_localize_cameras import SEED, place
 
 from piccolo import open_scan, second_look
@@ -31,10 +32,11 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
-from piccolo.judge.localization import Localization
 from piccolo.judge.pose_covariance import describe_errors
+from piccolo.judge.result import Result
+from piccolo.judge.result_parts import Beside, Source
 from piccolo.photo import Photo
-from piccolo.result import Beside, Result, Source, read_results
+from piccolo.result_files import read_results
 from piccolo.scan import Scan
 from research.synthetic.world import render_picture
 
@@ -312,7 +314,7 @@ def test_what_is_looked_at(scene, monkeypatch):
 
     def localize_beside(_prepared, _picture, poses, pictures, *_):
         asked.append([pose.key for pose in poses[:1]])
-        return Localization("localized", make_belief([0.93]), first.best_pose), tuple(pictures)
+        return judged("localized", make_belief([0.93]), first.best_pose), tuple(pictures)
 
     monkeypatch.setattr(second_look, "localize_beside", localize_beside)
 

@@ -27,15 +27,15 @@ from ..jobs.processes import WorkerLostError
 from ..jobs.threads import Workers
 from ..judge.conclude import follow_consensus
 from ..judge.consensus import Consensus
-from ..judge.localization import FocalLength
 from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
+from ..judge.result import Result
+from ..judge.result_parts import Beside, FocalLength, Source
 from ..judge.sure import SURE_CONFIDENCE
 from ..localization.means import Step, Trace
 from ..opening import open_files
 from ..photo import Photo, Vector
-from ..photo_reader import Settings, settings_json
+from ..photo_reader import Settings, settings_json, unreadable_result
 from ..problem.settings import CoarseToFineSettings
-from ..result import Beside, Result, Source, localization_of, unreadable_result, with_localization
 from ..scan import Scan
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
@@ -108,9 +108,7 @@ def list_changed_by_consensus(texts: Sequence[str], min_confidence: float) -> li
             continue
         for k, _ in camera:
             before = results[k]
-            after = with_localization(
-                before, follow_consensus(localization_of(before), consensus, min_confidence)
-            )
+            after = follow_consensus(before, consensus, min_confidence)
             after = replace(after, warnings=tuple(dict.fromkeys(after.warnings)))
             is_other = after.status != before.status or after.warnings != before.warnings
             if is_other or abs(after.confidence - before.confidence) > TOLD_CHANGE:

@@ -21,8 +21,8 @@ from ..jobs.memory import GB, memory_left, memory_taken
 from ..jobs.processes import Here, Processes, WorkerLostError
 from ..jobs.threads import num_cores
 from ..judge.probability import AMBIGUOUS, LOCALIZED
+from ..judge.result import FAILED, UNREADABLE, Result
 from ..judge.sure import WORTH_A_LOOK
-from ..result import FAILED, UNREADABLE, Result
 from ..scan import Scan
 from ..scan_map.map_file import save_map
 from ..scan_map.open_map import CachePolicy
@@ -47,7 +47,7 @@ def choose_exit_code(statuses: Collection[str]) -> int:
 
 def advise(result: Result) -> list[str]:
     """Return a line on what to do about a doubtful result; none if a warning says why nothing is certain."""
-    is_ruled_out = result.best_pose is None or (result.belief is not None and result.belief.ruled_out)
+    is_ruled_out = result.best_pose is None or result.belief.ruled_out
     if result.status == LOCALIZED or is_ruled_out or result.settings.get("preset") == "paper":
         return []
     focal = result.focal_length

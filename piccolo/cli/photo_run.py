@@ -23,12 +23,12 @@ from ..files.line_file import open_locked, write_line
 from ..jobs.memory import limit_memory
 from ..jobs.threads import Stopwatch, num_cores
 from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
+from ..judge.result import FAILED, UNREADABLE
 from ..panorama import read_panorama
 from ..panorama.cube import is_cube
 from ..panorama.masks import find_mask
 from ..panorama.photo import sha256_of
 from ..problem.settings import CoarseToFineSettings
-from ..result import FAILED, UNREADABLE
 from ..scan import Scan
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap

@@ -26,10 +26,11 @@ from ..geometry.pose import Pose
 from ..jobs.processes import InFlight
 from ..jobs.threads import Stopwatch
 from ..judge.probability import LOCALIZED
+from ..judge.result import FAILED, UNREADABLE, Result
 from ..panorama.photo import sha256_of
 from ..panorama.video import frames_of_chapters
 from ..photo import Photo
-from ..result import FAILED, UNREADABLE, Result, read_results
+from ..result_files import read_results
 from ..scan import Scan
 from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk

@@ -22,10 +22,10 @@ from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import turn_positions
 from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
+from ..judge.result import FAILED, Result
 from ..kernels.jit import F0, HALF, kernel
 from ..panorama import Panorama, texels
 from ..panorama.model import shrink
-from ..result import FAILED, Result
 from ..result_photo import read_as_localized
 from ..scan_map.open_map import find_prepared_map
 from ..scan_map.scan_map import SHAPE_ALONE, ScanMap, change_colors

@@ -9,5 +9,5 @@ A photo's way from its file to a result:
 5. `last_descent.refine_best` refines the best candidates to the end and chooses (`examine.choose`);
 6. `calibration` compares what the photo says of its geometry, and refines with what it finds;
 7. `judging.judge` gathers the case and a belief; `judge.conclude` names reasons, `judge.belief` decides;
-8. `result.with_localization` makes the result in the world, which a command writes.
+8. `places.add_places` names the scan and the storey; `Result.complete` says of which photo the result is.
 """

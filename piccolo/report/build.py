@@ -17,8 +17,9 @@ from ..files.atomic import temporary_folder, write_atomically
 from ..files.cache import digest_of_sources
 from ..geometry.pose import Pose
 from ..jobs.threads import Workers
+from ..judge.result import FAILED, UNREADABLE, Result
 from ..photo import File
-from ..result import FAILED, UNREADABLE, Result, check_scan
+from ..result_files import check_scan
 from ..scan import Scan
 from ..scan_map.scan_map import ScanMap
 from ..views.pictures import encode_image

@@ -7,8 +7,8 @@ from functools import cached_property
 from pathlib import Path
 
 from ..errors import InputError
+from ..judge.result import Result
 from ..panorama.photo import sha256_of
-from ..result import Result
 from ..result_photo import photo_of
 from .pictures import FRAME
 

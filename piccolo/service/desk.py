@@ -17,11 +17,11 @@ from ..errors import InputError
 from ..files.atomic import temporary_folder
 from ..jobs.processes import Function, Processes
 from ..jobs.threads import Workers
+from ..judge.result import Result
 from ..panorama.picture import open_picture
 from ..report import site
 from ..report.build import WIDTH, document_of_scan, list_poses
 from ..report.pictures import make_pictures
-from ..result import Result
 from ..scan import Scan
 from ..scan_map.open_map import write_map
 from ..scan_map.scan_map import ScanMap

@@ -31,8 +31,9 @@ from piccolo.files.line_file import open_locked
 from piccolo.jobs.cluster import Cluster
 from piccolo.jobs.memory import limit_memory
 from piccolo.jobs.threads import Workers
-from piccolo.photo_reader import settings_json
-from piccolo.result import UNREADABLE, check_scan, describe_failure, read_results
+from piccolo.judge.result import UNREADABLE
+from piccolo.photo_reader import describe_failure, settings_json
+from piccolo.result_files import check_scan, read_results
 from piccolo.scan import Scan
 from piccolo.scan_map.open_map import scan_sha256_of
 

@@ -17,7 +17,7 @@ from piccolo.files.json_file import document_of, parse_lines, read_bytes
 from piccolo.files.line_file import whole_size
 from piccolo.geometry.pose import MAX_ANGLE, MAX_DISTANCE, Pose, pose_errors
 from piccolo.judge.probability import LOCALIZED
-from piccolo.result import Result
+from piccolo.judge.result import Result
 from piccolo.scan import Scan
 
 from ..scene import Query, Scene, document_of_pose, pose_of
