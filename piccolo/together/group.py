@@ -18,7 +18,7 @@ from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.by_others import Shares
-from ..judge.localization import Localization
+from ..judge.result import Result
 from ..local_features.hypotheses import count_matches
 from ..local_features.matching import merge_matches
 from ..localization.means import Means
@@ -59,7 +59,7 @@ def localize_group(
     settings: CoarseToFineSettings,
     workers: Workers,
     watch: Stopwatch,
-) -> list[Localization]:
+) -> list[Result]:
     """Localize photos that may belong together, in any order; those that do not are localized alone."""
     means = Means(settings.effort, workers, watch)
     contents = [sha256(panorama.rgb.tobytes()).digest() for panorama in panoramas]
@@ -72,13 +72,11 @@ def localize_group(
     return [results[k] for k in range(len(panoramas))]
 
 
-def localize_linked(
-    members: Mapping[int, Member], means: Means, min_confidence: float
-) -> dict[int, Localization]:
+def localize_linked(members: Mapping[int, Member], means: Means, min_confidence: float) -> dict[int, Result]:
     """Return the results of those photos that are localized together, by their numbers."""
     links = find_links({k: member.found.problem for k, member in members.items()}, means.workers)
     group = Group(links, members)
-    results: dict[int, Localization] = {}
+    results: dict[int, Result] = {}
     for numbers in links.list_groups():
         left = set(numbers)
         while proposed := propose_places(group, left):
@@ -184,7 +182,7 @@ def examine_place(group: Group, places: Places, numbers: Collection[int], means:
 
 def judge_group(
     group: Group, tested: Sequence[Tested], probabilities: Array, means: Means, min_confidence: float
-) -> dict[int, Localization]:
+) -> dict[int, Result]:
     """Return the results of the photos that belong to the first of several places of their group."""
     best, *elsewhere = tested
     own = {

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from ..judge.candidate import Candidate
 from ..judge.consensus import MOST_CONFLICT, Consensus
-from ..judge.localization import Localization
 from ..judge.probability import LOCALIZED
+from ..judge.result import Result, nothing_found
 from ..localization.judging import Found, judge
 from ..localization.localize import (
     explain_nothing,
@@ -27,7 +27,7 @@ class Member:
     """A photo that was found by itself."""
 
     found: Found  # without what takes memory
-    alone: Localization
+    alone: Result
 
     @property
     def is_misplaced(self) -> bool:
@@ -40,7 +40,7 @@ class Member:
     @property
     def own_poses(self) -> list[tuple[Candidate, float]]:
         """Poses in the map with the probabilities of their places, best first; none if ruled out."""
-        if self.alone.pose is None or self.alone.belief.ruled_out:
+        if self.alone.best_pose is None or self.alone.belief.ruled_out:
             return []
         places = self.alone.belief.sound_places[:-1].tolist()
         return list(zip(self.found.selection.candidates, places, strict=False))
@@ -48,13 +48,13 @@ class Member:
 
 def find_members(
     scan_map: ScanMap, panoramas: Sequence[Panorama], settings: CoarseToFineSettings, means: Means
-) -> tuple[list[Localization], dict[int, Member]]:
+) -> tuple[list[Result], dict[int, Member]]:
     """Find each of several photos by itself.
 
     Those that are not sure are found again with the focal length that those that are sure tell. Returns the
     result of each photo alone, and those that were searched by their numbers.
     """
-    alone: list[Localization] = [Localization() for _ in panoramas]
+    alone: list[Result] = [nothing_found() for _ in panoramas]
     members: dict[int, Member] = {}
 
     def find_each(photos: Iterable[tuple[int, Panorama]]) -> None:
@@ -74,7 +74,7 @@ def find_members(
 def find_alone(
     scan_map: ScanMap, panorama: Panorama, settings: CoarseToFineSettings, means: Means
 ) -> Member | None:
-    """Find a photo by itself, with the best of several guesses of its focal length; None if none is searched."""
+    """Find a photo by itself, with the best of several guessed focal lengths; None if nothing is searched."""
     found: list[Member] = []
     for photo in list_guessed(panorama):
         problem = prepare_search(scan_map, photo, settings, means.watch)
@@ -89,7 +89,7 @@ def find_alone(
     return max(found, key=lambda member: member.alone.confidence)
 
 
-def expect_focal(panoramas: Sequence[Panorama], alone: Sequence[Localization]) -> dict[int, Panorama]:
+def expect_focal(panoramas: Sequence[Panorama], alone: Sequence[Result]) -> dict[int, Panorama]:
     """Return the photos that are not sure, by number, with the focal length that those that are sure tell.
 
     The photos are of one camera: what was given and what these say are averaged.
