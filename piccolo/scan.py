@@ -25,6 +25,7 @@ from .localization.places import add_places
 from .paper.localize import PaperMap, PaperSettings, localize as localize_by_paper
 from .photo import File, Photo, Prior, as_photo
 from .photo_reader import PhotoReader, Settings
+from .photos_together import MEMORY_OF_PHOTO, localize_photos
 from .problem.settings import CoarseToFineSettings
 from .scan_map.open_map import write_map
 from .scan_map.scan_map import ScanMap, check_within
@@ -34,7 +35,6 @@ from .together.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeS
 from .together.walk.frames import Motion
 from .together.walk.tracker import Tracker
 
-MEMORY_OF_PHOTO = 8e7  # [byte] that a photo keeps while others of its bundle are localized
 ONLY_DEFAULT = ("refine_focal", "gravity_vector")  # options of photos that the preset paper does not have
 Picture = File | Bytes | Photo  # a path or an array (H, W, 3) is a photo without options
 
@@ -242,6 +242,28 @@ class Scan:
             add_places(scan_map, one).complete(reader.make_blank(photo, picture, facts, settings, seconds))
             for photo, (picture, facts), one in zip(given, taken, found, strict=True)
         ]
+
+    def localize_together(
+        self,
+        photos: Iterable[Picture],
+        *,
+        prior: Prior | None = None,
+        gravity: Gravity | None = None,
+        min_confidence: float | None = None,
+    ) -> list[Result]:
+        """Localize photos that were taken at one place or on a short way, in any order, by what they share.
+
+        The program finds which of them show the same. Photos that belong to no other are localized alone, and
+        one that can't be read has a result that says so. `beside` of a result names those that it was
+        localized with.
+        """
+        check_kind("photos", photos, Iterable[Picture])
+        given = [as_photo(photo) for photo in photos]
+        settings = self._change(prior, gravity, min_confidence)
+        scan_map, settings = self.require_default_method("photos together", settings)
+        for photo in given:
+            self.check_options(photo, settings)
+        return localize_photos(self.reader, scan_map, given, settings, self.workers)
 
     def track(
         self,

@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import functools
 import io
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from piccolo.cloud.soa import pack_points
 from piccolo.cloud.stream import Cloud, stream_of_arrays
 from piccolo.cloud.voxels import VoxelTable, morton_order
 from piccolo.cloud.writers import vertex_rows, writing_ply
-from piccolo.geometry.pose import Pose, angle_between
+from piccolo.geometry.pose import Pose, angle_between, yaw_rotation
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization.localize import localize
 from piccolo.localization.means import Means, Trace
@@ -26,7 +27,7 @@ from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.view import average_view, normalize_view
 from research.synthetic import make_room
-from research.synthetic.world import make_query, make_world, scan_world
+from research.synthetic.world import make_query, make_world, mask_outside_field, photograph, scan_world
 
 SIZE = (4.5, 3.5, 2.5)
 NUM_POINTS = 60_000
@@ -105,6 +106,19 @@ def scan(seed, num_threads=2, num_points=NUM_POINTS):
     """A room as it is after it was opened."""
     prepared = scan_map(seed, num_points)
     return Scan(prepared, "room", CloudSettings(), AUTO, Workers(num_threads), {})
+
+
+def take_photos(seed, fov_deg, offset_by_eighth, width=WIDTH):
+    """Photos of a room, at offsets (3,) from a place and turned by eighths, each with its true pose."""
+    world = room(seed)[0]
+    base = query(seed).pose
+    taken = []
+    for eighth, offset in offset_by_eighth.items():
+        turn = yaw_rotation(eighth * math.pi / 4.0)
+        pose = Pose(turn @ base.R_cam_from_world, base.center_world + np.array(offset))
+        rgb = photograph(world.rooms[0], pose, width, Workers(2))
+        taken.append((Panorama(rgb, ~mask_outside_field(width, fov_deg, 0.0)), pose))
+    return taken
 
 
 def as_panorama(rgb):

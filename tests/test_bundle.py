@@ -31,7 +31,6 @@ from piccolo.together.bundle import (
     localize_bundle,
 )
 from piccolo.together.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
-from research.synthetic.world import mask_outside_field, photograph
 
 NEAR = np.array([2.0, -1.0, 0.5])
 SEED = 5
@@ -212,23 +211,10 @@ def test_two_photos_propose_the_scale(free):
     assert bundle_search.propose_with_scale(one, pair[0], other, turned, errors) == []
 
 
-def _take(seed, fov_deg, offset_by_eighth):
-    """Photos of a room, at offsets (3,) from a place and turned by eighths, each with its true pose."""
-    world = rooms.room(seed)[0]
-    base = rooms.query(seed).pose
-    taken = []
-    for eighth, offset in offset_by_eighth.items():
-        turn = yaw_rotation(eighth * math.pi / 4.0)
-        pose = Pose(turn @ base.R_cam_from_world, base.center_world + np.array(offset))
-        rgb = photograph(world.rooms[0], pose, rooms.WIDTH, Workers(2))
-        taken.append((Panorama(rgb, ~mask_outside_field(rooms.WIDTH, fov_deg, 0.0)), pose))
-    return taken
-
-
 @functools.lru_cache
 def _taken(seed, eighths=WHERE):
     """Photos of 60 degrees that were taken near each other."""
-    return _take(seed, 60.0, {k: np.random.default_rng(k).uniform(-0.3, 0.3, 3) for k in eighths})
+    return rooms.take_photos(seed, 60.0, {k: np.random.default_rng(k).uniform(-0.3, 0.3, 3) for k in eighths})
 
 
 def _relative(poses, far=0.0):
@@ -258,7 +244,7 @@ def _bits(found):
 
 
 def test_photos_are_localized_together_of_which_one_is_not_alone():
-    (narrow,) = _take(SEED, 35.0, {2: np.random.default_rng(2).uniform(-0.3, 0.3, 3)})
+    (narrow,) = rooms.take_photos(SEED, 35.0, {2: np.random.default_rng(2).uniform(-0.3, 0.3, 3)})
     photos, poses = zip(narrow, *_taken(SEED, (1, 7)), strict=True)
     alone = rooms.locate(photos[0], rooms.scan_map(SEED), rooms.KNOWN)
     assert alone.status == "not_localized"
@@ -315,7 +301,7 @@ def test_a_stranger_is_named_and_lowers_nobody():
 def test_positions_that_are_too_long_are_named():
     """Positions of spheres 1 m apart by 20 %: each is as by itself."""
     apart = {2: [0.0, 0.0, 0.0], 4: [0.8, 0.5, 0.1], 6: [0.8, -0.3, 0.0]}
-    photos, poses = zip(*_take(SEED, 60.0, apart), strict=True)
+    photos, poses = zip(*rooms.take_photos(SEED, 60.0, apart), strict=True)
     spheres = [rooms.as_panorama(photo.rgb) for photo in photos]
     wrong = [Pose(p.R_cam_from_world, 1.2 * p.center_world) for p in _relative(poses)]
     for found, pose in zip(_together(spheres, wrong), poses, strict=True):

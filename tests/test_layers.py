@@ -27,6 +27,7 @@ LAYERS = [
     "opening",
     "scan",
     "scan_walk",
+    "photos_together",
     "second_look",
     "photo_reader",
     "coloring",

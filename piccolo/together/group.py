@@ -52,6 +52,13 @@ class Tested(NamedTuple):
     supports: dict[int, Support]
 
 
+class Grouped(NamedTuple):
+    """The result of a photo, and the photos with which it was localized together; none if it was alone."""
+
+    result: Result
+    others: tuple[int, ...]  # numbers
+
+
 @one_blas_thread()
 def localize_group(
     scan_map: ScanMap,
@@ -59,34 +66,37 @@ def localize_group(
     settings: CoarseToFineSettings,
     workers: Workers,
     watch: Stopwatch,
-) -> list[Result]:
+) -> list[Grouped]:
     """Localize photos that may belong together, in any order; those that do not are localized alone."""
     means = Means(settings.effort, workers, watch)
     contents = [sha256(panorama.rgb.tobytes()).digest() for panorama in panoramas]
     order = sorted(range(len(panoramas)), key=contents.__getitem__)  # results depend on no other
     alone, members = find_members(scan_map, [panoramas[k] for k in order], settings, means)
     with watch.stage("refine"):
-        narrow = {k: member for k, member in members.items() if not member.found.problem.profile.has_shape}
-        found = localize_linked(narrow, means, settings.min_confidence)
-    results = dict(zip(order, (found.get(k, one) for k, one in enumerate(alone)), strict=True))
-    return [results[k] for k in range(len(panoramas))]
+        matched = {k: one for k, one in members.items() if one.found.problem.profile.uses_matches}
+        found = localize_linked(matched, means, settings.min_confidence)
+    grouped = {order[k]: Grouped(one, ()) for k, one in enumerate(alone)}
+    for k, (result, others) in found.items():
+        grouped[order[k]] = Grouped(result, tuple(sorted(order[other] for other in others)))
+    return [grouped[k] for k in range(len(panoramas))]
 
 
-def localize_linked(members: Mapping[int, Member], means: Means, min_confidence: float) -> dict[int, Result]:
+def localize_linked(members: Mapping[int, Member], means: Means, min_confidence: float) -> dict[int, Grouped]:
     """Return the results of those photos that are localized together, by their numbers."""
     links = find_links({k: member.found.problem for k, member in members.items()}, means.workers)
     group = Group(links, members)
-    results: dict[int, Result] = {}
+    grouped: dict[int, Grouped] = {}
     for numbers in links.list_groups():
         left = set(numbers)
         while proposed := propose_places(group, left):
             tested, probabilities = weigh_places(group, proposed, left, means)
-            found = {}
+            found: dict[int, Result] = {}
             if probabilities[0] >= EVEN:
                 found = judge_group(group, tested, probabilities, means, min_confidence)
-            results |= found
+            for k, result in found.items():
+                grouped[k] = Grouped(result, tuple(other for other in found if other != k))
             left -= found.keys() or tested[0].places.keys()
-    return results
+    return grouped
 
 
 def propose_places(group: Group, numbers: Collection[int]) -> list[Places]:

@@ -1,0 +1,167 @@
+"""Photos of one place without relative poses, localized together: links between them, and a room."""
+
+import functools
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import rooms
+
+from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
+from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.local_features.keypoints import Keypoints
+from piccolo.panorama import Panorama
+from piccolo.together.group import localize_group
+from piccolo.together.links import FIRM, WEAK, Links, Placed, compute_shared, find_links, list_pairs, spread
+
+SEED = 5
+TURN = (6.75, 7.0, 7.25)  # eighths, of photos of 75 degrees that overlap: none is sure alone
+
+
+def _sphere(num, seed):
+    """Keypoints in random directions, that look like no others."""
+    rng = np.random.default_rng(seed)
+    rays = rng.normal(size=(num, 3))
+    rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+    return Keypoints(rays, rays, rng.random(num, np.float32), rng.integers(0, 255, (num, 128), np.uint8))
+
+
+def _linked(*pairs):
+    """Links of photos of which only is known which are linked."""
+    numbers = {number for pair in pairs for number in pair}
+    matches = np.arange(3), np.arange(3)
+    every = {two: matches for one, other in pairs for two in ((one, other), (other, one))}
+    return Links(dict.fromkeys(numbers), {k: _sphere(3, k) for k in numbers}, every, rooms.WORKERS)
+
+
+def test_groups_are_photos_that_are_linked_by_others_too():
+    links = _linked((0, 4), (4, 7), (2, 3))
+    assert links.list_groups() == [[0, 4, 7], [2, 3]]
+    assert links.list_linked(4) == [0, 7]
+
+
+def test_of_many_photos_each_is_matched_with_those_that_look_most_like_it():
+    """Fifty photos in pairs that show the same."""
+    keypoints = {k: _sphere(40, k // 2) for k in range(50)}
+    asked = list_pairs(keypoints, rooms.WORKERS)
+    assert len(asked) < 50 * 49 / 2
+    assert {(k, k + 1) for k in range(0, 50, 2)} <= set(asked)
+    few = {k: keypoints[k] for k in range(4)}
+    assert len(list_pairs(few, rooms.WORKERS)) == 6, "of few photos all"
+
+
+def _facing(heading_deg):
+    """A photo of 60 degrees, of which only the part of the sphere that it shows is known."""
+    columns = (np.arange(64) + 0.5) * 360.0 / 64.0 - 180.0
+    is_valid = np.broadcast_to(np.abs(columns) < 30.0, (32, 64))
+    photo = SimpleNamespace(panorama=SimpleNamespace(is_valid=is_valid))
+    pose = Pose(yaw_rotation(np.radians(heading_deg)), np.zeros(3))
+    return SimpleNamespace(photo=photo), pose
+
+
+@pytest.mark.parametrize(
+    ("turned_deg", "least", "most"), [(0.0, 0.95, 1.0), (30.0, 0.3, 0.7), (90.0, 0.0, 0.0)]
+)
+def test_what_photos_show_in_common_is_told_by_their_keypoints(turned_deg, least, most):
+    rays = _sphere(4000, 0).rays
+    rays = rays[np.abs(np.arctan2(rays[:, 1], rays[:, 0])) < np.radians(29.0)]
+    keypoints = Keypoints(rays, rays, np.ones(len(rays)), np.zeros((len(rays), 128), np.uint8))
+    photos = [_facing(0.0), _facing(turned_deg)]
+    links = Links(
+        {k: problem for k, (problem, _) in enumerate(photos)}, {0: keypoints, 1: keypoints}, {}, rooms.WORKERS
+    )
+    places = {k: Placed(pose, np.full(len(rays), 3.0, np.float32)) for k, (_, pose) in enumerate(photos)}
+    assert least <= compute_shared(links, places, 0) <= most
+    nothing = {**places, 0: places[0]._replace(ranges=np.zeros(len(rays), np.float32))}
+    assert compute_shared(links, nothing, 0) == 0.0, "a bare wall is not known to be shown twice"
+
+
+@functools.lru_cache
+def _taken():
+    """Photos with their true poses."""
+    offsets = {k: np.random.default_rng(int(10 * k)).uniform(-0.2, 0.2, 3) for k in TURN}
+    return rooms.take_photos(SEED, 75.0, offsets, 1024)
+
+
+@functools.lru_cache
+def _problems():
+    return {k: rooms.ask(photo, rooms.scan_map(SEED), rooms.KNOWN) for k, (photo, _) in enumerate(_taken())}
+
+
+def test_poses_of_photos_follow_from_one_by_the_depth_of_the_scan():
+    links = find_links(_problems(), rooms.WORKERS)
+    poses = [pose for _, pose in _taken()]
+    anchor = {1: links.place(1, rooms.scan_map(SEED).from_world(poses[1]))}
+    places = spread(links, anchor, links.problems, FIRM)
+    assert sorted(places) == [0, 1, 2]
+    for k, placed in places.items():
+        distance, angle = pose_errors(rooms.scan_map(SEED).to_world(placed.pose), poses[k])
+        assert distance < 0.1
+        assert np.degrees(angle) < 2.0
+    within = WEAK._replace(reach=1e-3)
+    assert sorted(spread(links, anchor, links.problems, within)) == [1], "all are farther away"
+
+
+def test_a_mirrored_photo_is_linked_with_none():
+    photo = _taken()[1][0]
+    mirrored = replace(photo, rgb=photo.rgb[:, ::-1], is_valid=photo.is_valid[:, ::-1])
+    problems = {**_problems(), 1: rooms.ask(mirrored, rooms.scan_map(SEED), rooms.KNOWN)}
+    assert find_links(problems, rooms.WORKERS).list_linked(1) == []
+
+
+def _together(photos, num_threads=2):
+    return localize_group(rooms.scan_map(SEED), photos, rooms.KNOWN, Workers(num_threads), Stopwatch())
+
+
+@functools.lru_cache
+def _localized():
+    return _together([photo for photo, _ in _taken()])
+
+
+def test_photos_that_are_not_sure_alone_are_together():
+    photos, poses = zip(*_taken(), strict=True)
+    alone = rooms.locate(photos[1], rooms.scan_map(SEED), rooms.KNOWN)
+    assert alone.status == "ambiguous"
+    for number, (found, others) in enumerate(_localized()):
+        assert found.status == "localized"
+        assert others == tuple(k for k in range(3) if k != number)
+        distance, angle = pose_errors(found.pose, poses[number])
+        assert distance < 0.05
+        assert np.degrees(angle) < 1.5
+        assert distance < 4.0 * found.covariance.largest_std
+
+
+def _bits(found):
+    return [(one.status, one.confidence, one.pose.key, one.covariance.matrix.tobytes()) for one, _ in found]
+
+
+def test_the_same_bits_in_any_order_and_at_any_number_of_threads():
+    photos = [photo for photo, _ in _taken()]
+    assert _bits(_together(photos[::-1], 1))[::-1] == _bits(_localized())
+
+
+def test_a_stranger_and_a_photo_that_shows_nothing_stay_alone():
+    photos = [photo for photo, _ in _taken()]
+    ((stranger, _),) = rooms.take_photos(6, 60.0, {1: [0.0, 0.0, 0.0]})
+    nothing = Panorama(photos[0].rgb, np.zeros_like(photos[0].is_valid))
+    *right, other, empty = _together([*photos, stranger, nothing])
+    assert _bits(right) == _bits(_localized())
+    assert other.result.status == "not_localized"
+    assert other.others == ()
+    assert empty.result.best_pose is None
+
+
+def test_photos_that_share_nothing_are_localized_alone_by_the_api(tmp_path):
+    taken = rooms.take_photos(SEED, 360.0, {0: [0.0, 0.0, 0.0], 2: [0.3, 0.2, 0.0]})
+    spheres = [photo.rgb for photo, _ in taken]
+    missing = tmp_path / "missing.jpg"
+    scan = rooms.scan(SEED)
+    *found, failed = scan.localize_together([*spheres, missing])
+    alone = [scan.localize(sphere) for sphere in spheres]
+    assert [one.pose.key for one in found] == [one.pose.key for one in alone]
+    assert [one.beside for one in found] == [None, None]
+    assert failed.status == "unreadable"
+    assert str(missing) in failed.error
+    assert [one.status for one in scan.localize_together([missing])] == ["unreadable"]
+    assert scan.localize_together([]) == []
