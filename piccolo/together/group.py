@@ -18,6 +18,7 @@ from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.by_others import Shares
+from ..judge.probability import LOCALIZED
 from ..judge.result import Result
 from ..local_features.hypotheses import count_matches
 from ..local_features.matching import merge_matches
@@ -207,7 +208,10 @@ def judge_group(
         belongs = Shares(*support.shares[:2].tolist())
         placed = place_between(belongs, own.get(number), expected.get(number))
         is_refused = bool(member.alone.belief.ruled_out) and not member.is_misplaced
-        if is_refused or belongs.here < EVEN or placed.gaussian is None:
+        is_own = support.is_found and placed.shares.right >= placed.shares.missed
+        if is_refused or placed.gaussian is None or belongs.here < EVEN:
+            continue
+        if member.alone.status == LOCALIZED and not is_own:  # what is sure alone others do not move
             continue
         others = [k for k, one in enumerate(elsewhere) if number in one.places]
         poses = [elsewhere[k].places[number].pose for k in others]
