@@ -16,7 +16,7 @@ from piccolo.geometry.sphere import BLOCK_RINGS, find_cell, pixel_rays, solid_an
 from piccolo.judge.candidate import CONTRADICTS, Comparison
 from piccolo.judge.selection import is_mirrored
 from piccolo.localization.mirror import find_mirrored, is_found_again, list_mirrored
-from piccolo.optimize.channel_loss import CHANCE, NUM_BLOCKS
+from piccolo.optimize.channel_loss import CHANCE_CORRELATION, NUM_BLOCKS
 from piccolo.panorama import Panorama
 from piccolo.panorama.texels import pack_texels
 from research.synthetic.world import mask_outside_field, occlude
@@ -87,7 +87,7 @@ def test_blocks_correlate_as_their_twin():
 
 def test_score_and_ratio_by_hand():
     """Blocks below chance give nothing; only what both poses show is compared."""
-    half = CHANCE + 0.5 * (1 - CHANCE)
+    half = CHANCE_CORRELATION + 0.5 * (1 - CHANCE_CORRELATION)
     area = np.array([0.2, 0.1, 0.1])
     a = Comparison(np.array([half, 0.1, -0.9]), area, area, 0.5)
     assert a.score == pytest.approx(0.5 * 0.2 / 0.5)
@@ -134,7 +134,12 @@ def test_an_occluder_costs_what_it_hides(fraction):
     rgb, is_hidden = _hidden(fraction)
     behind = comparison.compare(_problem(rgb), true_pose)
     touched = _blocks_of(is_hidden)
-    lost = ((touched > 0.02) * seen.area * np.maximum(seen.correlation - CHANCE, 0) / (1 - CHANCE)).sum()
+    lost = (
+        (touched > 0.02)
+        * seen.area
+        * np.maximum(seen.correlation - CHANCE_CORRELATION, 0)
+        / (1 - CHANCE_CORRELATION)
+    ).sum()
     assert behind.score >= seen.score - lost - 0.02
     assert behind.score < seen.score - 0.3 * fraction * seen.score
     untouched = (touched == 0.0) & (seen.area > 0.0)

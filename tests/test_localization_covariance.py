@@ -75,7 +75,7 @@ def test_hessian_predicts_the_gradient_a_step_away(found):
     image = prepared.photo.images.full()
     levels = covariance.to_levels(points.channels)
     seen = points.offsets, levels, points.weights
-    problem = ChannelProblem(*seen, image.rgbx, image.width, covariance.SCALE)
+    problem = ChannelProblem(*seen, image.rgbx, image.width, covariance.COVARIANCE_SCALE)
     hessian = covariance.compute_hessian(problem, pose, WHOLE.steps[0].turn, 3.0)
     for delta in ([0.001, 0, 0, 0, 0.003, 0], [0, -0.0015, 0.001, 0.003, 0, -0.004]):
         moved = step(pose, np.array(delta))

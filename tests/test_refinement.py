@@ -89,7 +89,7 @@ def test_the_beam_narrows_from_stage_to_stage():
     found = beam.refine_starts(problem, starts, WHOLE_BEAM, workers)
     around = len(ladder.perturbations(1.0)) // ladder.PERTURBED_BATCH
     counts = [total for label, total in asked if label == "descend" and total != around]
-    assert counts == [-(-500 // beam.BATCH), 400 // beam.BATCH, 48, 8, 8, 2, 12]
+    assert counts == [-(-500 // beam.STARTS_A_TASK), 400 // beam.STARTS_A_TASK, 48, 8, 8, 2, 12]
     assert [sum(h.is_climbed for h in found), len(found)] == [2, 12]
     assert [one.first.limits.num_iterations for one in (WHOLE, PARTIAL)] == [5, 12]
     assert SECOND.limits.num_iterations == 12

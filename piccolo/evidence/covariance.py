@@ -36,17 +36,17 @@ ONE_BLOCK = 1.001  # above 1, so that one block may hold all information
 PIXEL_SHARE = 0.04  # of a pixel that is left in a pose, by trials with photos of 256 and 2048 px
 UNCALIBRATED = 0.005  # deviation of the focal length's logarithm: a calibration is better known
 UNCALIBRATED_SHARE = 0.15  # PIXEL_SHARE of a photo with unknown principal point and distortion
-LEAST_RANGE = 0.005 / math.radians(0.1)  # [m] for moves of differences: shorter ones are lost in noise
+LEAST_STEP_RANGE = 0.005 / math.radians(0.1)  # [m] for moves of differences: shorter ones are lost in noise
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
-TINY = 1e-12  # [rad^2, m^2] least variance of errors of one photo alone
-SCALE = LAST.limits.loss_scale * LEVELS_PER_UNIT
+TINY_VARIANCE = 1e-12  # [rad^2, m^2] least variance of errors of one photo alone
+COVARIANCE_SCALE = LAST.limits.loss_scale * LEVELS_PER_UNIT
 # normals (9, 3), in the camera's frame, of planes between halves: the seam of two lenses may have any azimuth
 NORMALS = np.array([*(yaw_rotation(k * math.pi / 8.0)[0] for k in range(8)), (0.0, 0.0, 1.0)])
 # of `score_halves`, by chance 1 in the mean; the best of nine planes has more in a quarter of photos
 MOST_SCORE = 3.0
 SEAMS = (0.25, 0.5, 0.75)  # of the points, on one side of a plane between parts of the scan
 SEAM_SCORE = 4.5  # of parts; single scans have more in a fifth of photos
-NUM_TRIED = 2  # planes
+NUM_TRIED_PLANES = 2  # planes
 HALF_LIMITS = (15, 1e-5)  # iterations of a half's descent, and tolerance [rad + m]
 
 
@@ -98,7 +98,7 @@ def compute_hessian(problem: ChannelProblem, pose: Pose, turn: float, median_ran
     The Gauss-Newton matrix ignores that the loss flattens, and would make deviations several times too small.
     The points of the problem are around the pose; the median of their ranges [m] makes moves of turns [rad].
     """
-    sizes = np.repeat([turn, turn * max(median_range, LEAST_RANGE)], 3)
+    sizes = np.repeat([turn, turn * max(median_range, LEAST_STEP_RANGE)], 3)
     ends = [step(pose, sign * delta) for delta in np.diag(sizes) for sign in (1.0, -1.0)]
     rotations = np.array([end.R_cam_from_world for end in ends])
     centers = np.array([end.center_world for end in ends]) - pose.center_world
@@ -177,7 +177,7 @@ def merge_covariances(found: Sequence[Array]) -> Array:
 def make_problem(points: Cells, image: Texels) -> ChannelProblem:
     """Make the problem of points, and the image that they are compared with."""
     return ChannelProblem(
-        points.offsets, to_levels(points.channels), points.weights, image.rgbx, image.width, SCALE
+        points.offsets, to_levels(points.channels), points.weights, image.rgbx, image.width, COVARIANCE_SCALE
     )
 
 
@@ -247,7 +247,7 @@ def disagreement(photo: PhotoImages, points: Cells, pose: Pose, covariance: Arra
 
     added = np.zeros((6, 6))
     scores = score_halves(sums, is_ahead)
-    tried = [k for k in np.argsort(-scores)[:NUM_TRIED] if scores[k] > MOST_SCORE]
+    tried = [k for k in np.argsort(-scores)[:NUM_TRIED_PLANES] if scores[k] > MOST_SCORE]
     if tried:
         ends = workers.map(separate, list(is_ahead[tried]), "covariance")
         steps = min(ends, key=lambda end: end[0])[1]
@@ -293,7 +293,7 @@ def split_errors(problem: Problem, pose: Pose, covariance: Array) -> PoseGaussia
     common = scan_covariance(problem.scan_map, median_range)
     common += layer_covariance(problem.scan_map, pose, median_range)
     variances, axes = np.linalg.eigh(covariance - common)
-    return PoseGaussian(pose, (axes * np.maximum(variances, TINY)) @ axes.T, common)
+    return PoseGaussian(pose, (axes * np.maximum(variances, TINY_VARIANCE)) @ axes.T, common)
 
 
 def estimate_errors(problem: Problem, candidate: Candidate, workers: Workers) -> Errors:

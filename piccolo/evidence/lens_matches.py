@@ -18,7 +18,7 @@ from ..optimize.self_calibration import NUM_OF_POSE
 from .self_calibration import Estimate, invert
 from .verification import LEAST_ERROR
 
-MOST = np.array([0.5, 0.2, 0.3, 0.3, 0.6])  # corrections that are searched
+MOST_LENS_CHANGE = np.array([0.5, 0.2, 0.3, 0.3, 0.6])  # corrections that are searched
 MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
 AGREES = 0.25  # least weight of a match that agrees
 MATCHED_DEVIATION = 0.015  # that errors in common add to a focal length by matches
@@ -66,7 +66,7 @@ def fit_matches(camera: Mount, pose: Pose, matches: Matches, widths: tuple[float
         found = found.add_known(np.zeros(len(prior)), LOOSE * np.eye(len(prior)))
         step = found.solve()
         end = add(end, step[:NUM_OF_POSE])
-        values = np.clip(values + step[NUM_OF_POSE:], -MOST, MOST)
+        values = np.clip(values + step[NUM_OF_POSE:], -MOST_LENS_CHANGE, MOST_LENS_CHANGE)
     weights = is_shown[:, 0] * robust(np.square(residuals).sum(axis=1))[1]
     slopes = np.einsum("n,nij,ni->nj", weights, J, residuals)
     of_focal = np.linalg.inv(found.matrix)[NUM_OF_POSE + FOCAL]

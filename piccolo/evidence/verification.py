@@ -32,7 +32,7 @@ from .occlusion import EXPLAINED, occlusion_mask
 
 PLACE = 0.1  # [m] the scan is drawn at positions on a grid of this spacing
 TURN = 0.05  # [rad] and at rotation vectors on one of this
-AROUND = 12  # [px] around the photo that are drawn too: it moves when the pose is refined
+DRAWN_AROUND = 12  # [px] around the photo that are drawn too: it moves when the pose is refined
 COS_AGREE = math.cos(math.radians(0.5))  # matches with a smaller error agree
 LEAST_ERROR = 2e-3  # [rad] of a keypoint along an axis: a third of a pixel
 # of the covariance by matches with the drawn scan, whose errors are not independent: by 76 crops of three
@@ -192,7 +192,7 @@ def pair(own: Keypoints, mine: NDArray[np.intp], picture: Located, theirs: NDArr
 def draw(problem: Problem, pose: Pose, view: PerspectiveView) -> tuple[ViewImage, Bytes]:
     """Draw what a view of a photo would show at a pose, and a little around; return also its mask."""
     mask = view.cut_mask(add_margin(problem.photo.panorama.is_valid))
-    shown = cv2.dilate(mask, np.ones((2 * AROUND + 1,) * 2, np.uint8))
+    shown = cv2.dilate(mask, np.ones((2 * DRAWN_AROUND + 1,) * 2, np.uint8))
     turned = Pose(view.R_sphere_from_view.T @ pose.R_cam_from_world, pose.center_world)
     return render_gray(problem.scan_map.octree, turned, shown > 0, view.focal), np.asarray(shown, np.uint8)
 

@@ -34,11 +34,11 @@ class ChoiceModel(NamedTuple):
 
 LEAST_STD = 0.003  # [m] deviations below this are taken for it
 MOST_STD = 0.3  # [m] and those above this
-LEAST_SCORE = 0.02
+LEAST_LOGIT_SCORE = 0.02
 LEAST_DRAWN = 0.01
 LEAST_RATIO = 0.1
 MOST_RATIO = 1.2
-CONTRADICTED = 0.01  # odds that what the user says is wrong
+CONTRADICTED_ODDS = 0.01  # odds that what the user says is wrong
 NOISE_MATCHES = 8  # added to the number that agree, as so many may by chance
 # By tools/benchmark.py calibration. Each feature counts in one direction only.
 FEATURES = ("log of the ratio", "log of the score", "log of the matches, or of the drawn score")
@@ -53,7 +53,7 @@ MODELS: dict[EvidenceKind, ChoiceModel] = {
 def pose_features(standing: Standing) -> Array:
     """Return the features of a pose's odds, as FEATURES names them; by coloured views alone the first two."""
     ratio = min(max(standing.ratio, LEAST_RATIO), MOST_RATIO)
-    of_views = [ratio, max(standing.score, LEAST_SCORE)]
+    of_views = [ratio, max(standing.score, LEAST_LOGIT_SCORE)]
     if standing.drawn_score is not None:
         return np.log([*of_views, max(standing.drawn_score, LEAST_DRAWN)])
     if standing.num_matches is None:

@@ -8,8 +8,8 @@ import numpy as np
 
 from ..problem.profile import Profile
 from .alternatives import alternative_poses, sort_by_score
-from .candidate import MAX_COMPARED, NOTHING, Candidate, Selection
-from .probability import CONTRADICTED, Standing, log_odds
+from .candidate import MAX_COMPARED, NO_CHOICE, Candidate, Selection
+from .probability import CONTRADICTED_ODDS, Standing, log_odds
 from .sure import SURE_ODDS
 
 FAINT_SCORE = 0.1  # a pose with less ends no search: the scan is not drawn to see whether it is sure
@@ -21,9 +21,9 @@ RIVAL_SCORE = 0.5  # least score of a pose that could win against a sure one, as
 
 
 def rank(candidates: Sequence[Candidate]) -> Selection:
-    """Return the best candidate by score, and at most MAX_COMPARED elsewhere; NOTHING if there are none."""
+    """Return the best candidate by score, and at most MAX_COMPARED elsewhere; NO_CHOICE if there are none."""
     if not candidates:
-        return NOTHING
+        return NO_CHOICE
     best = sort_by_score(candidates)[0]
     return Selection(best, tuple(alternative_poses(best, candidates, count=MAX_COMPARED)))
 
@@ -57,7 +57,7 @@ def assess_alone(profile: Profile, ranked: Sequence[Candidate]) -> list[Standing
     Poses that contradict the prior share the odds that the prior is wrong.
     """
     is_wrong = [bool(h.against_prior) for h in ranked]
-    log_prior = math.log(CONTRADICTED / max(sum(is_wrong), 1))
+    log_prior = math.log(CONTRADICTED_ODDS / max(sum(is_wrong), 1))
     counts = count_matches(profile, ranked)
     standings = []
     for h, wrong, count in zip(ranked, is_wrong, counts, strict=True):

@@ -29,10 +29,10 @@ from ..views.view import ViewArrays
 from .ladder import climb, refine
 from .search import Starts, search_poses
 
-BATCH = 16  # starts that a thread takes at a time
+STARTS_A_TASK = 16  # starts that a thread takes at a time
 NUM_FOUND = 12  # poses of a search, at most
 FAINT_PART = 0.25  # of the best score: poses with less are dropped
-NUM_SCORED = 64  # starts, if only the best score is needed
+NUM_SCORED_STARTS = 64  # starts, if only the best score is needed
 
 
 class Ends(NamedTuple):
@@ -125,7 +125,7 @@ def score_briefly(problem: Problem, effort: Effort, workers: Workers) -> float:
 
 def score_mirror(problem: Problem, effort: Effort, workers: Workers) -> float:
     """Return the best score of a brief search with the photo mirrored."""
-    return score_briefly(problem.mirror(), effort.brief(NUM_SCORED), workers)
+    return score_briefly(problem.mirror(), effort.brief(NUM_SCORED_STARTS), workers)
 
 
 def score_near(problem: Problem, pose: Pose, workers: Workers) -> float:
@@ -138,7 +138,7 @@ def score_near(problem: Problem, pose: Pose, workers: Workers) -> float:
 
 def score_starts(problem: Problem, starts: Starts, workers: Workers) -> float:
     """Return the best score after short descents from the best starts."""
-    best = starts.take(np.arange(min(NUM_SCORED, len(starts.candidate))))
+    best = starts.take(np.arange(min(NUM_SCORED_STARTS, len(starts.candidate))))
     return descend_prepared(problem, best, FIRST, workers).best_score
 
 
@@ -207,7 +207,7 @@ def descend_prepared(problem: Problem, starts: Starts, stage: Stage, workers: Wo
     cone = find_cone(image)
 
     def run(lo: int) -> None:
-        part = slice(lo, lo + BATCH)
+        part = slice(lo, lo + STARTS_A_TASK)
         descend_starts(
             views,
             view,
@@ -222,6 +222,6 @@ def descend_prepared(problem: Problem, starts: Starts, stage: Stage, workers: Wo
             scores[part],
         )
 
-    workers.map(run, range(0, len(t), BATCH), "descend")
+    workers.map(run, range(0, len(t), STARTS_A_TASK), "descend")
     order = np.argsort(-scores, kind="stable")
     return Ends(Starts(R, t, starts.candidate).take(order), scores[order])

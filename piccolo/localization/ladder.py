@@ -31,7 +31,7 @@ PERTURBED_BATCH = 3  # perturbed poses that a thread takes
 MAX_PERTURBATIONS = 5  # rounds
 MIN_GAIN = 0.02  # of the score in a round, relative; a round with less is the last
 MAX_UNOCCLUDED = 2  # rounds that mask occluders
-MIN_SCORE_LEFT = 0.9  # fraction of the score that a descent on points must keep
+MIN_POINTS_SCORE_LEFT = 0.9  # fraction of the score that a descent on points must keep
 
 
 def refine(problem: Problem, start: Pose, workers: Workers, stage: Stage) -> Hypothesis:
@@ -151,7 +151,8 @@ def settle(problem: Problem, found: Candidate, workers: Workers) -> Candidate:
 def converge(problem: Problem, found: Candidate, stage: Stage, workers: Workers) -> Candidate:
     """Descend on the points visible from the pose, in the rounds of a stage.
 
-    It descends with the candidate's unoccluded photo; an end below MIN_SCORE_LEFT of its score is discarded.
+    It descends with the candidate's unoccluded photo; an end below MIN_POINTS_SCORE_LEFT of its score is
+    discarded.
     """
     assert found.unoccluded is not None
     shown = problem.show(found.unoccluded.photo)
@@ -163,7 +164,7 @@ def converge(problem: Problem, found: Candidate, stage: Stage, workers: Workers)
         if math.dist(pose.center_world, center) < stage.rounds.arrived:
             break
     end = examine(problem, pose, found)
-    return end if end.score > MIN_SCORE_LEFT * found.score else found
+    return end if end.score > MIN_POINTS_SCORE_LEFT * found.score else found
 
 
 @kernel

@@ -12,7 +12,7 @@ from ..judge.candidate import Candidate
 from ..judge.selection import explains_more
 from ..local_features.hypotheses import propose_poses
 from ..local_features.matching import match
-from ..problem.photo_images import ACROSS
+from ..problem.photo_images import MIRROR
 from ..problem.problem import Problem
 from ..problem.settings import Effort
 from .attempts import FIRST_BEAM, join_features
@@ -64,7 +64,7 @@ def search_mirrored(
 def list_mirrored(R_cam_from_map: Array, num_yaws: int) -> Array:
     """Return rotations (2 N, 3, 3) of a mirrored photo: at the tilt of a pose, and at that upside down."""
     yaws = uniform_yaws(num_yaws)
-    tilt = ACROSS @ R_cam_from_map @ ACROSS
+    tilt = MIRROR @ R_cam_from_map @ MIRROR
     return np.asarray(tilt @ np.concatenate([yaws, UPSIDE_DOWN @ yaws]))
 
 

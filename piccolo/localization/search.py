@@ -19,7 +19,7 @@ from ..problem.profile import Tilts
 from ..problem.settings import Effort
 from ..scan_map.scan_map import ScanMap
 from ..views.candidate_views import WIDE_RINGS
-from .correlation import BLOCK, Samples, correlate_pairs, masked_correlation, weigh_by_area
+from .correlation import VIEWS_A_PRODUCT, Samples, correlate_pairs, masked_correlation, weigh_by_area
 
 ROTATIONS_AT_ONCE = 256  # that a thread averages
 SCORES_AT_ONCE = 1 << 23  # 32 MB
@@ -148,7 +148,7 @@ def best_poses_wide(
 
 def views_at_once(num_rotations: int) -> int:
     """Return the number of views whose scores are held at a time."""
-    return max(SCORES_AT_ONCE // num_rotations, BLOCK)
+    return max(SCORES_AT_ONCE // num_rotations, VIEWS_A_PRODUCT)
 
 
 def best_poses(scores: Samples, pool: int, least: np.float32 = LOWEST) -> tuple[Int64s, Int64s, Samples]:

@@ -25,13 +25,13 @@ from ..photo import NOTHING_KNOWN, Prior
 from ..scan_map.scan_map import ScanMap
 from ..views.points_around import Place, RecentViews, round_position
 from ..views.view import Cells, ViewConfig, normalize_view
-from .photo_images import ACROSS, PhotoImages, make_photo
+from .photo_images import MIRROR, PhotoImages, make_photo
 from .profile import VIEWS, Profile, choose_profile, choose_scales
 from .stages import ViewName
 
-MAX_WIDTH = 2048  # [px] of the photo for the loss: more costs time and gains nothing
+MAX_LOSS_WIDTH = 2048  # [px] of the photo for the loss: more costs time and gains nothing
 NUM_POINTS = 30_000  # of the last descent, among those that the photo shows
-VOXEL_PER_RANGE = 1 / 150  # of points around a pose, with which the photo is compared
+AROUND_VOXEL_PER_RANGE = 1 / 150  # of points around a pose, with which the photo is compared
 COARSE_VOXEL_PER_RANGE = 1 / 40  # of coarser ones
 
 
@@ -90,7 +90,7 @@ class Problem:
 
     def mirror(self) -> "Problem":
         """Return the problem of the mirrored photo, without features of the map and the prior's heading."""
-        rotations = None if self.rotations is None else ACROSS @ self.rotations @ ACROSS
+        rotations = None if self.rotations is None else MIRROR @ self.rotations @ MIRROR
         return replace(
             self.without_map_features(),
             photo=self.photo.mirror(),
@@ -116,7 +116,7 @@ class Problem:
     def surroundings_at(self, pose: Pose) -> tuple[PackedPoints, PackedPoints]:
         """Return the points around a pose with which the photo is compared, and coarser ones."""
         around = partial(self.views.surroundings, round_position(pose))
-        return around(VOXEL_PER_RANGE), around(COARSE_VOXEL_PER_RANGE)
+        return around(AROUND_VOXEL_PER_RANGE), around(COARSE_VOXEL_PER_RANGE)
 
 
 def prepare_problem(
@@ -166,6 +166,6 @@ def find_features(
 
 
 def make_texels(panorama: Panorama) -> Texels:
-    """Pack a panorama into texels, at most MAX_WIDTH wide."""
-    panorama = shrink(panorama, MAX_WIDTH)
+    """Pack a panorama into texels, at most MAX_LOSS_WIDTH wide."""
+    panorama = shrink(panorama, MAX_LOSS_WIDTH)
     return pack_texels(panorama.rgb, panorama.is_valid)

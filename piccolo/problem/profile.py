@@ -63,12 +63,12 @@ class DifferenceSteps(NamedTuple):
     inflation: float  # so that 95 % of true poses lie in the 95 % region (tools/benchmark.py calibration)
 
 
-STEPS = (
+COLOR_STEPS = (
     DifferenceSteps("full", math.radians(0.1), 1.1),
     DifferenceSteps("fine", math.radians(0.3), 0.36),
 )
 # of dark, noisy photos; they are too few to calibrate
-ROUGH_STEPS = DifferenceSteps("middle", math.radians(0.3), 1.0)
+ROUGH_COLOR_STEPS = DifferenceSteps("middle", math.radians(0.3), 1.0)
 # of edges, whose poses have larger errors
 SHAPE_STEPS = (
     DifferenceSteps("full", math.radians(0.5), 1.0),
@@ -112,8 +112,8 @@ class Profile:
     discount: float = 1.0  # of scores by shape: of few blocks chance explains more
     # geometry and errors
     fits_sphere: bool = True  # what a panorama shows of the sphere is compared with the scan
-    steps: tuple[DifferenceSteps, ...] = STEPS  # of a covariance, which is the mean by these
-    rough_steps: DifferenceSteps = ROUGH_STEPS  # if all of these are too rough
+    steps: tuple[DifferenceSteps, ...] = COLOR_STEPS  # of a covariance, which is the mean by these
+    rough_steps: DifferenceSteps = ROUGH_COLOR_STEPS  # if all of these are too rough
     own_share: float = 1.0  # of the variance by images: errors that other photos do not have in common
     has_few_blocks: bool = False  # so that their covariance is too small in the mean
     compares_halves: bool = True  # lenses stitched with an error: halves that disagree add to the covariance

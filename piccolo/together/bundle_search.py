@@ -21,7 +21,7 @@ from ..judge.candidate import Candidate, Selection
 from ..judge.case import Errors
 from ..judge.consensus import MOST_CONFLICT
 from ..judge.localization import Localization
-from ..judge.probability import CONTRADICTED, posterior
+from ..judge.probability import CONTRADICTED_ODDS, posterior
 from ..judge.selection import assess
 from ..localization.judging import Found
 from ..localization.ladder import refine
@@ -33,10 +33,10 @@ from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
 MISSED = 0.25  # chosen: of photos, those without a right pose found (of BENCHMARK.md's phone photos a sixth)
 MOST_UNSEEN = 1.0 / 3.0  # chosen: of photos, those that may show nothing
 SILENT = 0.05  # chosen: of photos of the bundle, those that show nothing of their place
-CHANCE = 0.02  # chosen: probability that a photo has a pose near that by a wrong pose of the bundle
+CHANCE_NEAR = 0.02  # chosen: probability that a photo has a pose near that by a wrong pose of the bundle
 NUM_BUNDLES = 4  # poses of the bundle that are tested
 SCALES = 0.5, 2.0  # of positions in metres that are proposed, so that a wrong scale is seen
-LEAST_APART = 0.5  # [m] photos nearer to each other say nothing of the scale
+LEAST_DISTANCE = 0.5  # [m] photos nearer to each other say nothing of the scale
 NUM_LIKELY = 2  # poses of a photo that propose a scale, those with the most probability
 
 
@@ -83,11 +83,11 @@ class Support(NamedTuple):
         The odds of a photo alone allow for `num_places` places, of which it has the best. If the others leave
         one place, or the few of exchanged photos, the odds are multiplied by `num_places`.
         """
-        belongs = 1.0 - CONTRADICTED
+        belongs = 1.0 - CONTRADICTED_ODDS
         here = self.odds * self.num_places
         right = belongs * (1.0 - self.local_share) * here
         exchanged = self.odds_exchanged * self.num_places
-        of_others = [CONTRADICTED, CONTRADICTED * (self.odds_elsewhere + exchanged)]
+        of_others = [CONTRADICTED_ODDS, CONTRADICTED_ODDS * (self.odds_elsewhere + exchanged)]
         return np.array([right, belongs * (self.local_share * here + SILENT), *of_others])
 
     @property
@@ -137,7 +137,7 @@ def propose_with_scale(
     if angle_between(relative.R_cam_from_world, found.R_cam_from_world) > ONE_IN_BUNDLE.angle:
         return []
     is_free = errors.log_scale > 1.0
-    if found_apart < LEAST_APART or given_apart <= 0.0:
+    if found_apart < LEAST_DISTANCE or given_apart <= 0.0:
         return []
     scale = found_apart / given_apart
     if not is_free and not SCALES[0] < scale < SCALES[1]:
@@ -229,12 +229,12 @@ def weigh_bundles(tested: Sequence[Sequence[Support]], members: Sequence[Member]
     for of_one in tested:
         odds_of_seen = sorted(s.odds for s in of_one)[int(len(of_one) * MOST_UNSEEN) :]
         missed = min(math.log((o + MISSED) / (o + 1.0)) for o in odds_of_seen)
-        gain = (1 - sum(s.is_found for s in of_one)) * math.log(CHANCE)
+        gain = (1 - sum(s.is_found for s in of_one)) * math.log(CHANCE_NEAR)
         coincidence = max(gain - math.log(num_proposed), min(gain, 0.0))
-        of_photos = sum(math.log1p(s.odds + CONTRADICTED * s.odds_elsewhere) for s in of_one)
+        of_photos = sum(math.log1p(s.odds + CONTRADICTED_ODDS * s.odds_elsewhere) for s in of_one)
         logits.append(of_photos + missed + coincidence)
     alone = [sum(p for _, p in member.own_poses) for member in members]
-    apart = math.log(CONTRADICTED) - sum(math.log(max(1.0 - p, LEAST_NONE)) for p in alone)
+    apart = math.log(CONTRADICTED_ODDS) - sum(math.log(max(1.0 - p, LEAST_NONE)) for p in alone)
     odds = np.exp(np.array([*logits, 0.0, apart]) - max([*logits, 0.0, apart]))
     odds = np.append(odds[:-2], odds[-2:].sum())
     return np.asarray(odds / odds.sum())

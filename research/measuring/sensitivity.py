@@ -54,7 +54,7 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
         "SURE_ODDS",
     ),
     "localization.attempts": ("ENOUGH_MATCHES", "FIRST_MIRROR_RATIO", "NUM_MATCHED"),
-    "localization.beam": ("FAINT_PART", "NUM_FOUND", "NUM_SCORED"),
+    "localization.beam": ("FAINT_PART", "NUM_FOUND", "NUM_SCORED_STARTS"),
     "localization.calibration": ("CLEARLY",),
     "localization.judging": ("WORTH_ASKING",),
     "localization.ladder": ("MAX_PERTURBATIONS", "MIN_GAIN", "PERTURBED_ANGLE", "PERTURBED_DISTANCE"),
