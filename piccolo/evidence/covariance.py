@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Int64s, Mask
-from ..geometry.pose import Pose, log_so3, rotate_points, step, yaw_rotation
+from ..geometry.pose import Pose, rotate_points, step, step_between, yaw_rotation
 from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
 from ..geometry.sphere import compute_indices, find_cell, make_grid
 from ..jobs.threads import Workers
@@ -208,13 +208,13 @@ def descend_half(points: Cells, images: Sequence[Texels], pose: Pose) -> tuple[f
     It descends in the images from coarse to fine, and in the finest alone; the lower end counts. The finest
     alone can't correct degrees, and a coarse one misleads in flat places.
     """
+    start = Pose(pose.R_cam_from_world, np.zeros(3))  # around which the points are
     ends = []
     for way in (images, images[-1:]):
-        R = pose.R_cam_from_world.copy()
-        t = np.zeros(3)
+        R = start.R_cam_from_world.copy()
+        t = start.center_world.copy()
         losses = [descend_channels(make_problem(points, image), *HALF_LIMITS, R, t) for image in way]
-        delta = np.concatenate([log_so3(R @ pose.R_cam_from_world.T), pose.R_cam_from_world @ t])
-        ends.append((losses[-1], delta))
+        ends.append((losses[-1], step_between(start, Pose(R, t))))
     return min(ends, key=lambda end: end[0])
 
 
