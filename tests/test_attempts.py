@@ -24,6 +24,7 @@ from piccolo.localization.means import NO_TRACE
 from piccolo.localization.search import search_poses
 from piccolo.panorama import GPano, Panorama
 from piccolo.photo import Prior
+from piccolo.problem.method import METHOD
 from piccolo.problem.photo_images import MIRROR
 from piccolo.problem.problem import Features
 from piccolo.problem.settings import CoarseToFineSettings, Effort
@@ -98,8 +99,8 @@ def test_of_a_clear_photo_the_mirrored_one_must_start_a_tenth_worse(is_turned):
     search_poses(problem, "known", EFFORT.brief(), once)
     searched, by_one = ([label for label, _ in done].count("search") for done in (asked, own))
     assert searched == (1 if is_turned else 2) * by_one
-    assert attempts.beats_mirror(0.55, 0.5)
-    assert not attempts.beats_mirror(0.54, 0.5)
+    assert attempts.beats_mirror(METHOD, 0.55, 0.5)
+    assert not attempts.beats_mirror(METHOD, 0.54, 0.5)
 
 
 def test_the_mirrored_problem_is_that_of_the_mirrored_photo():

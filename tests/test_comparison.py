@@ -19,6 +19,7 @@ from piccolo.localization.mirror import find_mirrored, is_found_again, list_mirr
 from piccolo.optimize.channel_loss import CHANCE_CORRELATION, NUM_BLOCKS
 from piccolo.panorama import Panorama
 from piccolo.panorama.texels import pack_texels
+from piccolo.problem.method import METHOD
 from research.synthetic.world import mask_outside_field, occlude
 
 WIDTH = rooms.WIDTH
@@ -188,7 +189,7 @@ def test_what_contradicts_is_masked_and_the_rest_stays():
 
 def _is_turned_over(problem, best):
     mirrored = find_mirrored(problem, best, rooms.AUTO.effort, rooms.WORKERS)
-    return is_mirrored(count_agreeing(problem, best, rooms.WORKERS), mirrored)
+    return is_mirrored(METHOD, count_agreeing(problem, best, rooms.WORKERS), mirrored)
 
 
 @pytest.mark.parametrize(("fov_deg", "asks_map"), [(None, True), (None, False), (90.0, True)])
@@ -220,8 +221,8 @@ def test_a_photo_that_was_turned_over_is_told(fov_deg, asks_map):
 def test_a_photo_that_views_explain_as_well_is_not_mirrored_by_its_matches(score, num_matches, expected):
     """The mirrored photo has more matches, as in a place that looks alike in a mirror."""
     own = make_candidate(0.0, 0.5, 20)
-    assert is_mirrored(own, make_candidate(0.0, score, num_matches)) == expected
-    assert not is_mirrored(own, None)
+    assert is_mirrored(METHOD, own, make_candidate(0.0, score, num_matches)) == expected
+    assert not is_mirrored(METHOD, own, None)
 
 
 def test_the_mirrored_photo_is_searched_as_thoroughly_as_its_own_pose_needs():

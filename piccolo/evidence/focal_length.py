@@ -64,7 +64,6 @@ MOST_VARIANCE = 1.0  # of a focal length's logarithm: with more, the picture say
 FOCAL_WIDTHS = (0.5, *CALIBRATED)
 ALL_WIDTHS = (0.1, 0.05, 0.02, 0.02, 0.1)
 DISAGREE = 2.0  # deviations between picture and what was given, by which chance parts them in one of twenty
-EDGE_ERROR = 0.2  # chosen: [px] of the sphere at the picture's edge, which all blocks may have in common
 UNCONFIRMED = 0.1  # chosen: weight of a photo's own focal length, against the one given, in what it confirms
 AT_REST = 0.5  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
@@ -146,9 +145,9 @@ def fit_focal(problem: Problem, best: Candidate, workers: Workers, is_first: boo
     assert prior is not None
     claim = make_claim(prior, camera)
     matches = list_matches(problem, best, workers)
-    starts = fit_matches(mount, best.pose, matches, ALL_WIDTHS)
+    starts = fit_matches(problem.method, mount, best.pose, matches, ALL_WIDTHS)
     near, far = descend_lens(problem, best, claim, starts, workers, is_first)
-    by_matches = fit_matches(mount, best.pose, matches, FOCAL_WIDTHS)
+    by_matches = fit_matches(problem.method, mount, best.pose, matches, FOCAL_WIDTHS)
     estimate = estimate_lens(problem, best.pose, near, by_matches)
     return weigh_claim(prior, camera, estimate, estimate_lens(problem, best.pose, far))
 
@@ -313,7 +312,7 @@ def estimate_lens(problem: Problem, pose: Pose, end: FreeEnd, by_matches: MatchF
         estimate = estimate._replace(information=np.zeros_like(estimate.information))
     camera = problem.given.cameras[0].camera
     per_px = math.tau * camera.focal[0] / (0.5 * camera.width * problem.photo.panorama.rgb.shape[1])
-    estimate = add_errors(estimate, (EDGE_ERROR * per_px) ** 2 * np.eye(len(LENS)))
+    estimate = add_errors(estimate, (problem.method.edge_error * per_px) ** 2 * np.eye(len(LENS)))
     if by_matches is not None:
         estimate = add_matches(estimate, by_matches)
     median_range = compute_median_range(problem.view_at(pose, "points"))

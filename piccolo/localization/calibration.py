@@ -33,7 +33,6 @@ from ..problem.problem import Features, Problem
 from ..problem.stages import Limits
 from .last_descent import refine_best
 
-CLEARLY = 2.5  # deviations by which matches must tell another focal length
 MIN_CALIBRATED_SCORE_LEFT = 0.95  # fraction of the score that it must keep
 MAX_CALIBRATIONS = 4  # fits of a focal length
 SUSPECT = 0.8  # deviations between claim and picture, from which other geometries are searched
@@ -89,9 +88,9 @@ def refine_with(
 def follow_matches(problem: Problem, found: Selection, workers: Workers) -> tuple[Problem, Selection]:
     """Begin with the focal length by which most matches agree, if that is clearly another."""
     matches = list_matches(problem, found.best, workers)
-    by_matches = fit_matches(problem.given.cameras[0], found.best.pose, matches, FOCAL_WIDTHS)
+    by_matches = fit_matches(problem.method, problem.given.cameras[0], found.best.pose, matches, FOCAL_WIDTHS)
     change = float(by_matches.values[FOCAL])
-    if abs(change) * math.sqrt(by_matches.information) < CLEARLY:
+    if abs(change) * math.sqrt(by_matches.information) < problem.method.clear_deviations:
         return problem, found
     other = refine_with(problem, found, np.array([change]), by_matches.pose, workers)
     return other if other[1].best.score > MIN_CALIBRATED_SCORE_LEFT * found.best.score else (problem, found)

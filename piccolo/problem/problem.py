@@ -25,6 +25,7 @@ from ..photo import NOTHING_KNOWN, Prior
 from ..scan_map.scan_map import ScanMap
 from ..views.points_around import Place, RecentViews, round_position
 from ..views.view import Cells, ViewConfig, normalize_view
+from .method import METHOD, Method
 from .photo_images import MIRROR, PhotoImages, make_photo
 from .profile import VIEWS, Profile, choose_profile, choose_scales
 from .stages import ViewName
@@ -61,6 +62,11 @@ class Problem:
     beside: tuple[Matches, ...] = ()  # with each of the photos beside this one whose poses are known
 
     @property
+    def method(self) -> Method:
+        """The numbers by which it is decided."""
+        return self.profile.method
+
+    @property
     def pixel(self) -> float:
         """Pixel [rad] of the photo as it was given, but none finer than those that are compared."""
         width: int = min(self.given.rgb.shape[1], self.photo.panorama.rgb.shape[1])
@@ -85,7 +91,7 @@ class Problem:
 
     def retake(self, panorama: Panorama) -> "Problem":
         """Return the problem of the photo as another camera took it; what it shows may lie elsewhere."""
-        fresh = prepare_problem(panorama, self.scan_map, self.prior, self.gravity)
+        fresh = prepare_problem(panorama, self.scan_map, self.prior, self.gravity, self.method)
         return fresh if self.profile.uses_matches else fresh.by_views()
 
     def mirror(self) -> "Problem":
@@ -120,7 +126,11 @@ class Problem:
 
 
 def prepare_problem(
-    panorama: Panorama, scan_map: ScanMap, prior: Prior = NOTHING_KNOWN, gravity: Gravity = "auto"
+    panorama: Panorama,
+    scan_map: ScanMap,
+    prior: Prior = NOTHING_KNOWN,
+    gravity: Gravity = "auto",
+    method: Method = METHOD,
 ) -> Problem:
     """Prepare a panorama for the search where its prior allows; the photo may give the camera's tilt."""
     source = panorama
@@ -142,7 +152,7 @@ def prepare_problem(
         colors=Once(make_texels, panorama),
         scan_map=scan_map,
         views=make_views(scan_map),
-        profile=choose_profile(photo.small.valid_share, photo.is_partial, scan_map.has_shape),
+        profile=choose_profile(photo.small.valid_share, photo.is_partial, scan_map.has_shape, method),
         prior=prior,
         gravity=gravity,
         features=features,

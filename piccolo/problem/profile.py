@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple
 from ..geometry.nearness import STARTING, STARTING_NARROW, Nearness
 from ..views.candidate_views import SEARCH_VIEW
 from ..views.view import ViewConfig
+from .method import METHOD, Method
 from .stages import FIRST, SECOND, SOFT, ImageName, Stage, ViewName
 
 # the scan's shape; its coloured views; these, and local features of the scan drawn at the pose
@@ -86,6 +87,7 @@ class Profile:
     `of_part` and `by_shape` say what other kinds have instead.
     """
 
+    method: Method = METHOD  # the numbers by which all kinds are decided
     evidence: EvidenceKind = "drawn scan"  # with what poses are compared
     is_partial: bool = False  # the photo shows a part of the sphere
     is_narrow: bool = False  # views tell little: matches with the drawn scan, and photos beside, place it
@@ -179,9 +181,10 @@ PARTIAL = of_part(WHOLE)
 PROFILES = (WHOLE, PARTIAL, by_shape(WHOLE), by_shape(PARTIAL))
 
 
-def choose_profile(valid_share: float, is_partial: bool, has_shape: bool) -> Profile:
+def choose_profile(valid_share: float, is_partial: bool, has_shape: bool, method: Method = METHOD) -> Profile:
     """Return the profile of a photo that shows a share of the sphere, in a scan with colours or by shape."""
-    found = next(p for p in PROFILES if (p.is_partial, p.has_shape) == (is_partial, has_shape))
+    kind = next(p for p in PROFILES if (p.is_partial, p.has_shape) == (is_partial, has_shape))
+    found = replace(kind, method=method)
     return replace(found, discount=math.sqrt(valid_share)) if has_shape and is_partial else found
 
 

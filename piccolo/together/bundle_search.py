@@ -196,7 +196,7 @@ def find_support(
         counted = ranked[k] if is_counted else count_agreeing(problem, ranked[k], workers)
         errors = estimate_errors(problem, counted, workers)
         errors = errors.widen(fit.pose_covariance) if fit else errors
-    p = posterior(assess(problem.profile, selection), errors.std_of_fit)
+    p = posterior(assess(problem.profile, selection), errors.std_of_fit, problem.method)
     none = max(float(p[-1]), LEAST_NONE)
     odds_elsewhere = float(p[:-1].sum() - p[k]) / none
     num_places = len(problem.scan_map.sparse)
