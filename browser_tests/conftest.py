@@ -15,7 +15,7 @@ sys.path += [str(ROOT), str(ROOT / "tests")]
 from report_scenes import HOSTILE, House, mixed_house  # noqa: E402
 
 from piccolo.cli import localize, report  # noqa: E402
-from piccolo.result import Source  # noqa: E402
+from piccolo.judge.result_parts import Source  # noqa: E402
 from research.synthetic import make_room  # noqa: E402
 
 ARTIFACTS = ROOT / "browser_tests" / "screenshots"

@@ -11,7 +11,7 @@ import pytest
 from conftest import opening
 from report_scenes import House
 
-from piccolo.result import read_results
+from piccolo.result_files import read_results
 
 ROOT = Path(__file__).resolve().parents[1]
 FLAT = ROOT / "examples" / "flat"

@@ -12,7 +12,7 @@ import pytest
 from piccolo.cli import report
 from piccolo.cloud.settings import BY_FILE
 from piccolo.jobs.threads import Workers
-from piccolo.result import read_results
+from piccolo.result_files import read_results
 from piccolo.scan_map.open_map import open_points
 
 FIELD = 70.0  # [deg]

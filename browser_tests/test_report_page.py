@@ -11,7 +11,7 @@ from report_scenes import HOSTILE
 from piccolo.camera.model import pinhole
 from piccolo.cloud.settings import BY_FILE
 from piccolo.jobs.threads import Workers
-from piccolo.result import read_results
+from piccolo.result_files import read_results
 from piccolo.scan_map.open_map import open_points
 from piccolo.views.pictures import cut, fill_holes
 from piccolo.views.surfels import render_points

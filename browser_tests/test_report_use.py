@@ -10,7 +10,7 @@ import pytest
 
 from piccolo.panorama.cameras import GUESS, HOW
 from piccolo.panorama.read import CHOICES
-from piccolo.result import read_results
+from piccolo.result_files import read_results
 
 DOWNLOAD = "Download as a table (CSV)"
 # the names of all photos that the key n leads to

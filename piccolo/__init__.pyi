@@ -1,22 +1,24 @@
 # The public names: type checkers read them here, and at run time each is imported from here at its first use.
 from .errors import InputError as InputError
 from .geometry.pose import Pose as Pose
-from .judge.localization import (
+from .judge.pose_covariance import PoseCovariance as PoseCovariance
+from .judge.result import Result as Result
+from .judge.result_parts import (
+    Alone as Alone,
     Alternative as Alternative,
     Evidence as Evidence,
     FocalLength as FocalLength,
+    Gap as Gap,
+    Source as Source,
+    WalkFrame as WalkFrame,
 )
-from .judge.pose_covariance import PoseCovariance as PoseCovariance
 from .opening import Cloud as Cloud, open_scan as open_scan
 from .paper.localize import PaperSettings as PaperSettings
 from .photo import GpsPrior as GpsPrior, Photo as Photo, Prior as Prior
 from .problem.settings import CoarseToFineSettings as CoarseToFineSettings
 from .report.build import ReportSettings as ReportSettings, write_report as write_report
-from .result import Result as Result, Source as Source
 from .scan import Scan as Scan
 from .scan_walk import Walk as Walk
 from .together.walk.frames import Motion as Motion
-from .together.walk.path import Gap as Gap
-from .together.walk.results import Alone as Alone, WalkFrame as WalkFrame
 
 __version__: str

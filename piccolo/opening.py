@@ -15,9 +15,9 @@ from .cloud.stream import ARRAYS, CloudStream, open_cloud, stream_of_arrays
 from .errors import InputError
 from .files.cache import sha256_of_files
 from .jobs.threads import ProgressCallback, Stopwatch, Workers, no_progress, num_cores, report_progress
-from .opened_scan import OpenedScan, Settings
 from .paper.localize import PaperMap, prepare as prepare_by_paper
 from .photo import File
+from .photo_reader import Settings
 from .problem.settings import CoarseToFineSettings
 from .scan import Scan
 from .scan_map.open_map import CachePolicy, find_prepared_map, open_map
@@ -165,9 +165,9 @@ def open_scan(
         stream = stream_of_arrays(
             given.source, None if given.ignore_colors else given.colors, given.color_range
         )
-        return Scan(scan_of(stream, str(ARRAYS), given.settings, settings, workers, Stopwatch()))
+        return scan_of(stream, str(ARRAYS), given.settings, settings, workers, Stopwatch())
     policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
-    return Scan(open_files(given.paths, given.settings, settings, policy, workers))
+    return open_files(given.paths, given.settings, settings, policy, workers)
 
 
 def open_files(
@@ -176,14 +176,14 @@ def open_files(
     settings: Settings,
     cache: CachePolicy,
     workers: Workers,
-) -> OpenedScan:
+) -> Scan:
     """Open the files of a scan, or a prepared map."""
     watch = Stopwatch()
     name = str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
     if isinstance(settings, CoarseToFineSettings):
         scan_map = open_map(paths, cloud_settings, cache, workers, watch, settings.prior)
         check_within(scan_map, settings.prior.within)
-        return OpenedScan(scan_map, name, cloud_settings, settings, workers, watch.seconds)
+        return Scan(scan_map, name, cloud_settings, settings, workers, watch.seconds)
     if map_path := find_prepared_map(paths):
         raise InputError(f"{map_path}: a prepared map; the preset paper needs the cloud itself")
     with watch.stage("read"):
@@ -199,7 +199,7 @@ def scan_of(
     settings: Settings,
     workers: Workers,
     watch: Stopwatch,
-) -> OpenedScan:
+) -> Scan:
     """Prepare a scan for the method that the settings belong to."""
     prepared: ScanMap | PaperMap
     if isinstance(settings, CoarseToFineSettings):
@@ -215,4 +215,4 @@ def scan_of(
         with watch.stage("prepare"):
             prepared = prepare_by_paper(points, settings)
     prepared = replace(prepared, scan_sha256=cloud.sha256)
-    return OpenedScan(prepared, name, cloud_settings, settings, workers, watch.seconds)
+    return Scan(prepared, name, cloud_settings, settings, workers, watch.seconds)

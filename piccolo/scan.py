@@ -1,29 +1,45 @@
-"""The public class `Scan`: photos and walks are localized in it."""
+"""The public class `Scan`: photos, bundles of photos and walks are localized in it."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from itertools import repeat
 from pathlib import Path
 from typing import Any
 
 from .arguments import check_kind, check_one_each
 from .arrays import Bytes, Floats
+from .cloud.settings import CloudSettings
 from .cloud.soa import PackedPoints
 from .errors import InputError
+from .evidence.occlusion import occlusion_mask
 from .files.atomic import check_output
 from .geometry.pose import Gravity, Pose, check_pose
-from .opened_scan import OpenedScan, Settings, make_failed_result
+from .jobs.memory import check_memory
+from .jobs.threads import Stopwatch, Workers
+from .judge.probability import LOCALIZED
+from .judge.result import Result, nothing_found
+from .judge.result_parts import FocalLength
+from .localization.localize import has_guessed_focal, localize, localize_guessed
+from .localization.means import NO_TRACE, Means, Trace
+from .localization.places import add_places
+from .paper.localize import PaperMap, PaperSettings, localize as localize_by_paper
 from .photo import File, Photo, Prior, as_photo
-from .result import Result
+from .photo_reader import PhotoReader, Settings
+from .problem.settings import CoarseToFineSettings
 from .scan_map.open_map import write_map
-from .scan_map.scan_map import ScanMap
+from .scan_map.scan_map import ScanMap, check_within
 from .scan_walk import Walk
-from .together.bundle_adjustment import RelativeScale
+from .together.bundle import localize_bundle
+from .together.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
 from .together.walk.frames import Motion
+from .together.walk.tracker import Tracker
 
+MEMORY_OF_PHOTO = 8e7  # [byte] that a photo keeps while others of its bundle are localized
+ONLY_DEFAULT = ("refine_focal", "gravity_vector")  # options of photos that the preset paper does not have
 Picture = File | Bytes | Photo  # a path or an array (H, W, 3) is a photo without options
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class Scan:
     """A scan in which photos can be localized: `open_scan` returns it. Several threads may use it at once.
 
@@ -33,36 +49,39 @@ class Scan:
     `open_scan`, by default "auto" and 0.9.
     """
 
-    def __init__(self, opened: OpenedScan) -> None:
-        self._opened = opened
+    prepared: ScanMap | PaperMap  # for the method that the settings belong to
+    # path as given; a tuple of paths if several files are one scan; "arrays" for arrays
+    name: str | tuple[str, ...]
+    cloud_settings: CloudSettings
+    settings: Settings  # defaults of photos
+    workers: Workers
+    seconds: dict[str, float]  # [s] spent on reading and preparing the scan, by stage
 
     def __repr__(self) -> str:
         """Return `Scan(...)` with the scan's name."""
         return f"Scan({self.name!r})"
 
     @property
-    def name(self) -> str | tuple[str, ...]:
-        """Path of the scan as given; a tuple of paths if several files are one scan; "arrays" for arrays."""
-        return self._opened.name
-
-    @property
-    def seconds(self) -> dict[str, float]:
-        """Time [s] spent on reading and preparing the scan, by stage."""
-        return self._opened.seconds
-
-    @property
     def points(self) -> PackedPoints:
         """Coloured points, to draw the scan: `x`, `y`, `z` (N,) [m] in the frame of `from_world`."""
-        return self._opened.prepared.points
+        return self.prepared.points
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings about the scan, one line each."""
-        return self._opened.warnings
+        return self.prepared.warnings
+
+    @property
+    def reader(self) -> PhotoReader:
+        """Reader of photos for the scan."""
+        named = self.prepared.crs if isinstance(self.prepared, ScanMap) else ""
+        digest = self.prepared.scan_sha256 or None
+        crs = self.cloud_settings.crs or named
+        return PhotoReader(self.name, self.cloud_settings, digest, crs, self.warnings)
 
     def from_world(self, pose: Pose) -> Pose:
         """Transform a pose from the scan's own coordinates to the frame of `points`."""
-        return self._opened.prepared.from_world(check_pose(pose, "`pose`"))
+        return self.prepared.from_world(check_pose(pose, "`pose`"))
 
     def save(self, path: File) -> None:
         """Write the prepared map to the file `path`, which `open_scan` opens in place of the scan's files.
@@ -70,10 +89,10 @@ class Scan:
         Raises InputError for a scan opened with `PaperSettings`, or too large to be prepared as a whole.
         """
         check_kind("path", path, File)
-        if not isinstance(self._opened.prepared, ScanMap):
+        if not isinstance(self.prepared, ScanMap):
             raise InputError("save: found a scan of the preset paper, wanted one of the default method")
         check_output(Path(path))
-        write_map(self._opened.prepared, Path(path), self._opened.workers)
+        write_map(self.prepared, Path(path), self.workers)
 
     def localize(
         self,
@@ -106,7 +125,45 @@ class Scan:
         >>> scan.localize(photo, prior=piccolo.Prior(height=(1.0, 1.5))).status
         'localized'
         """
-        return self._opened.localize(as_photo(photo), self._change(prior, gravity, min_confidence))
+        return self.localize_photo(as_photo(photo), self._change(prior, gravity, min_confidence))
+
+    def localize_photo(
+        self,
+        photo: Photo,
+        settings: Settings,
+        focal: FocalLength | None = None,
+        trace: Trace = NO_TRACE,
+    ) -> Result:
+        """Localize a photo by settings of the scan's method, as all that ask for one photo do.
+
+        `focal` is its focal length as found with those of others, which counts then. `trace` notes the steps
+        of the default method.
+        """
+        watch = Stopwatch()
+        self.check_options(photo, settings)
+        reader = self.reader
+        picture, facts = reader.take(photo, watch, focal)
+        gps = None
+        if isinstance(self.prepared, PaperMap):
+            assert isinstance(settings, PaperSettings)
+            found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
+        else:
+            assert isinstance(settings, CoarseToFineSettings)
+            gps = reader.make_gps_prior(facts, settings.prior)
+            run = localize_guessed if has_guessed_focal(picture) else localize
+            means = Means(settings.effort, self.workers, watch, trace)
+            found = nothing_found()
+            if gps is not None:
+                near = replace(settings, prior=gps.apply_to(settings.prior))
+                found = run(self.prepared, picture, near, means)
+            if found.status != LOCALIZED:
+                gps = gps and replace(gps, is_used=False)
+                found = run(self.prepared, picture, settings, means)
+            found = add_places(self.prepared, found)
+        if focal is not None:
+            found = replace(found, focal_length=focal.update(found.focal_length))
+        blank = reader.make_blank(photo, picture, facts, settings, watch.seconds)
+        return replace(found.complete(blank), gps_prior=gps)
 
     def localize_many(
         self,
@@ -132,11 +189,11 @@ class Scan:
         def localize(picture: Picture, prior: Prior | None) -> Result:
             photo = as_photo(picture)
             settings = self._change(prior, gravity, min_confidence)
-            self._opened.check_options(photo, settings)
+            self.check_options(photo, settings)
             try:
-                return self._opened.localize(photo, settings)
+                return self.localize_photo(photo, settings)
             except Exception as error:
-                return make_failed_result(self._opened, photo, error, settings)
+                return self.reader.make_failed(photo, error, settings)
 
         return map(localize, photos, priors)
 
@@ -162,7 +219,29 @@ class Scan:
         given = [as_photo(photo) for photo in photos]
         check_one_each("relative_poses", relative_poses, len(given), "photo")
         settings = self._change(prior, gravity, min_confidence)
-        return self._opened.localize_bundle(given, relative_poses, settings, relative_scale)
+        scan_map, settings = self.require_default_method("`relative_poses`", settings)
+        for photo in given:
+            self.check_options(photo, settings)
+        poses = [check_pose(pose, "`relative_poses`") for pose in relative_poses]
+        if not given:
+            return []
+        watch = Stopwatch()
+        needed = len(given) * MEMORY_OF_PHOTO
+        check_memory(needed, f"{len(given)} photos together", "localize fewer together")
+        reader = self.reader
+        taken = [reader.take(photo, watch) for photo in given]
+        pictures = [picture for picture, _ in taken]
+        if any(map(has_guessed_focal, pictures)):
+            raise InputError("`relative_poses`: found a focal length that is a guess, wanted a known one")
+        errors = RelativeErrors()
+        if relative_scale == "unknown":
+            errors = errors._replace(log_scale=UNKNOWN_SCALE)
+        found = localize_bundle(scan_map, pictures, poses, settings, self.workers, watch, errors)
+        seconds = {stage: spent / len(found) for stage, spent in watch.seconds.items()}
+        return [
+            add_places(scan_map, one).complete(reader.make_blank(photo, picture, facts, settings, seconds))
+            for photo, (picture, facts), one in zip(given, taken, found, strict=True)
+        ]
 
     def track(
         self,
@@ -182,7 +261,11 @@ class Scan:
             result of each frame, from all frames.
         """
         check_kind("motion", motion, Motion | None)
-        return Walk(self._opened, self._change(prior, gravity, min_confidence), motion or Motion())
+        settings = self._change(prior, gravity, min_confidence)
+        scan_map, settings = self.require_default_method("walks", settings)
+        check_within(scan_map, settings.prior.within)
+        quiet = Workers(self.workers.num_threads, warn=self.workers.warn)
+        return Walk(self.reader, Tracker(scan_map, settings, quiet, motion or Motion()))
 
     def localize_walk(
         self,
@@ -244,13 +327,28 @@ class Scan:
         The array (H, W) of uint8 is a full sphere, W = 2 H, also for a photo of a part of it: 255 where the
         photo contradicts the scan, 0 where the scan explains it, 128 where one of them shows nothing.
         """
-        return self._opened.occlusion_mask(as_photo(photo), pose)
+        pose = self.from_world(pose)
+        return occlusion_mask(self.points, self.reader.read(as_photo(photo)), pose)
+
+    def check_options(self, photo: Photo, settings: Settings) -> None:
+        """Raise InputError for options that this scan or its method does not have."""
+        self.reader.check(photo)
+        if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
+            check_within(self.prepared, settings.prior.within)
+        elif given := [name for name in ONLY_DEFAULT if getattr(photo, name)]:
+            raise InputError(f"`{given[0]}`: not an option of the preset paper")
+
+    def require_default_method(self, what: str, settings: Settings) -> tuple[ScanMap, CoarseToFineSettings]:
+        """Return the map and settings; InputError for the preset paper, which does not have `what`."""
+        if not isinstance(self.prepared, ScanMap) or not isinstance(settings, CoarseToFineSettings):
+            raise InputError(f"{what}: not available with the preset paper")
+        return self.prepared, settings
 
     def _change(self, prior: Prior | None, gravity: Gravity | None, min_confidence: float | None) -> Settings:
         """Return the settings of `open_scan` with options that are not None in place of its own."""
         options: dict[str, Any] = {"prior": prior, "gravity": gravity, "min_confidence": min_confidence}
         given = {name: value for name, value in options.items() if value is not None}
-        settings = self._opened.settings
+        settings = self.settings
         if unknown := given.keys() - {f.name for f in fields(settings)}:
             raise InputError(f"`{min(unknown)}`: not an option of the preset paper")
         return replace(settings, **given)

@@ -12,19 +12,18 @@ from .arrays import Bytes
 from .errors import InputError
 from .files.json_file import reading_once
 from .geometry.pose import Pose, check_pose
-from .jobs.threads import Progress, Stopwatch, Workers, no_progress
-from .judge.localization import Localization
+from .jobs.threads import Progress, Stopwatch, no_progress
+from .judge.result import Result
+from .judge.result_parts import WalkFrame
 from .localization.places import add_places
-from .opened_scan import OpenedScan, Settings, make_failed_result, settings_json
 from .panorama import Panorama
 from .panorama.photo import read_photo_facts, sha256_of
 from .photo import File, Photo, as_photo
+from .photo_reader import PhotoReader, settings_json
 from .problem.problem import Problem
-from .result import Result, with_localization
-from .scan_map.scan_map import check_within
-from .together.walk.frames import Frame, Motion, check_times
+from .together.walk.frames import Frame, check_times
 from .together.walk.path import believe
-from .together.walk.results import WalkFrame, describe_frame, make_localization, make_localizations
+from .together.walk.results import describe_frame, make_localization, make_localizations
 from .together.walk.tracker import Tracker
 
 NO_REFINING = "`refine_focal`: not an option of walks; refine the focal length with a single photo"
@@ -40,17 +39,11 @@ class Prepared(NamedTuple):
 
 
 class Walk:
-    """A camera tracked through a scan: `add` frames in order; `finish` uses all frames together.
+    """A camera tracked through a scan: `add` frames in order; `finish` uses all frames together."""
 
-    Raises InputError for the preset paper, and for a focal length that is to be refined.
-    """
-
-    def __init__(self, scan: OpenedScan, settings: Settings, motion: Motion) -> None:
-        scan_map, settings = scan.require_default_method("walks", settings)
-        check_within(scan_map, settings.prior.within)
-        quiet = Workers(scan.workers.num_threads, warn=scan.workers.warn)
-        self.scan = scan
-        self.tracker = Tracker(scan_map, settings, quiet, motion)
+    def __init__(self, reader: PhotoReader, tracker: Tracker) -> None:
+        self.reader = reader
+        self.tracker = tracker
         self.tracker.read = self._read_again
         self.more_settings: dict[str, object] = {}  # that results repeat
         self.photos: list[Photo] = []
@@ -59,7 +52,7 @@ class Walk:
 
     def settings_of(self, photo: Photo) -> dict[str, object]:
         """Return the settings of a frame as its result repeats them."""
-        settings = settings_json(self.tracker.settings, self.scan.cloud_settings, photo)
+        settings = settings_json(self.tracker.settings, self.reader.cloud_settings, photo)
         motion = self.tracker.motion
         return {**settings, "walk": {**asdict(motion), "max_speed": motion.speed}, **self.more_settings}
 
@@ -97,7 +90,7 @@ class Walk:
         photo = as_photo(frame)
         name = name or photo.name
         settings = self.tracker.settings
-        self.scan.check_options(photo, settings)
+        self.reader.check(photo)
         if photo.refine_focal:
             raise InputError(NO_REFINING)
         with reading_once():
@@ -108,11 +101,11 @@ class Walk:
             except Exception as error:
                 if isinstance(photo.picture, np.ndarray):
                     raise
-                failed = make_failed_result(self.scan, photo, error, settings, name)
+                failed = self.reader.make_failed(photo, error, settings, name)
                 return Prepared(photo, failed, None, None)
         with watch.stage("prepare"):
             problem = self.tracker.prepare(panorama)
-        blank = self.scan.make_blank(photo, panorama, facts, settings, watch.seconds)
+        blank = self.reader.make_blank(photo, panorama, facts, settings, watch.seconds)
         return Prepared(photo, replace(blank, pano=name), panorama, problem)
 
     def follow(self, prepared: Prepared, time: float | None = None, odometry: Pose | None = None) -> Result:
@@ -161,16 +154,14 @@ class Walk:
         found = make_localizations(self.tracker, show)
         return [self._result(blank, *parts) for blank, parts in zip(self.blanks, found, strict=True)]
 
-    def _result(self, blank: Result, found: Localization, walk: WalkFrame) -> Result:
+    def _result(self, blank: Result, found: Result, walk: WalkFrame) -> Result:
         """Return the result of a frame; a frame that can't be read keeps its place in the walk."""
-        result = replace(blank, walk=walk)
-        if blank.error is not None:
-            return result
-        return with_localization(result, add_places(self.tracker.scan_map, found))
+        blank = replace(blank, walk=walk)
+        return blank if blank.error else add_places(self.tracker.scan_map, found).complete(blank)
 
     def _read(self, photo: Photo, name: str) -> Panorama:
         """Read a photo, which warnings call by its name; its focal length counts as exact."""
-        panorama = self.scan.read(photo)
+        panorama = self.reader.read(photo)
         path = name if isinstance(photo.picture, np.ndarray) else photo.name
         warnings = tuple(warning.replace(path, name) for warning in panorama.warnings)
         return replace(panorama, focal_prior=None, warnings=warnings)

@@ -11,8 +11,8 @@ from consistency import contradictions_of_line, find_contradictions, lines_of_re
 from piccolo.cloud.readers import e57, las, mesh, reader, text
 from piccolo.files import cache
 from piccolo.jobs.memory import limit_memory
+from piccolo.judge.result import Result
 from piccolo.kernels import jit
-from piccolo.result import Result
 
 # A shell starts what runs in the background with Ctrl-C ignored, as then would be what a test starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)

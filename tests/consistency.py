@@ -9,7 +9,7 @@ import numpy as np
 
 from piccolo.arguments import MIN_CONFIDENCE
 from piccolo.geometry.nearness import RIGHT
-from piccolo.result import FAILED, FORMAT, UNREADABLE, Result
+from piccolo.judge.result import FAILED, FORMAT, UNREADABLE, Result
 
 SCHEMA = json.loads((Path(__file__).resolve().parents[1] / "docs" / "result.schema.json").read_text())
 VALIDATOR = jsonschema.Draft202012Validator(SCHEMA)
@@ -42,9 +42,7 @@ def check_probabilities(result):
         return
     if abs(sum(known) - 1.0) > ROUNDING:
         yield f"probabilities {known} that add up to {sum(known)}"
-    if result.belief is None:
-        yield "probabilities without a belief"
-    elif result.best_pose is not None:
+    if result.best_pose is not None:
         told = [result.confidence, *others, result.probability_none]
         believed = result.belief.probabilities
         if len(believed) != len(told) or np.abs(believed - told).max() > ROUNDING:

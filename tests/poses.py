@@ -7,8 +7,8 @@ import numpy as np
 
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.judge.localization import Evidence
-from piccolo.result import Result
+from piccolo.judge.result import Result
+from piccolo.judge.result_parts import Evidence
 
 WIDTH = 512
 SIZE = (WIDTH, WIDTH // 2)
@@ -26,6 +26,13 @@ def tilted_poses(num_poses, center=CENTER):
 
 def result(pano, pose, status="localized", cloud="a.ply", **changes):
     return Result(status=status, cloud=cloud, pano=str(pano), best_pose=pose, **(WORDS | changes))
+
+
+def judged(status, belief, pose, **more):
+    """The result of a photo alone, its probabilities as they are believed."""
+    probabilities = belief.probabilities.tolist()
+    best, none = probabilities[0], probabilities[-1]
+    return Result(status, best, best_pose=pose, belief=belief, probability_none=none, **more)
 
 
 def write_results(path, results):

@@ -7,11 +7,10 @@ import numpy as np
 
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
-from piccolo.judge.localization import Alternative, Evidence
 from piccolo.judge.pose_covariance import PoseCovariance
-from piccolo.result import Result, Source, unreadable_result
-from piccolo.together.walk.path import Gap
-from piccolo.together.walk.results import WalkFrame
+from piccolo.judge.result import Result
+from piccolo.judge.result_parts import Alternative, Evidence, Gap, Source, WalkFrame
+from piccolo.photo_reader import unreadable_result
 from piccolo.views.pictures import encode_image
 from research.synthetic.world import make_world, photograph, pose_of_query, scan_world
 

@@ -18,7 +18,6 @@ from piccolo.geometry.pose import Pose, angle_between
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization.localize import localize
 from piccolo.localization.means import Means, Trace
-from piccolo.opened_scan import OpenedScan
 from piccolo.panorama import Panorama
 from piccolo.problem.problem import prepare_problem
 from piccolo.problem.settings import CoarseToFineSettings
@@ -105,7 +104,7 @@ def query(seed, variant="clean", index=0, width=WIDTH):
 def scan(seed, num_threads=2, num_points=NUM_POINTS):
     """A room as it is after it was opened."""
     prepared = scan_map(seed, num_points)
-    return Scan(OpenedScan(prepared, "room", CloudSettings(), AUTO, Workers(num_threads), {}))
+    return Scan(prepared, "room", CloudSettings(), AUTO, Workers(num_threads), {})
 
 
 def as_panorama(rgb):

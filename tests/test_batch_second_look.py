@@ -16,9 +16,11 @@ import pytest
 import rooms
 from batches import untimed
 from pictures import encoded, write
+from poses import judged
 from test_localize_cameras import SEED, place
 
-from piccolo import open_scan, opened_scan
+from piccolo import open_scan, second_look
+from piccolo.batch import localizer as localizer_module
 from piccolo.batch.localizer import MOST_PICTURES, Localizer, Look, list_looks_beside
 from piccolo.batch.results_file import StreamOutput
 from piccolo.camera import Mount
@@ -30,11 +32,12 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
-from piccolo.judge.localization import Localization
 from piccolo.judge.pose_covariance import describe_errors
-from piccolo.opened_scan import OpenedScan
+from piccolo.judge.result import Result
+from piccolo.judge.result_parts import Beside, Source
 from piccolo.photo import Photo
-from piccolo.result import Beside, Result, Source, read_results
+from piccolo.result_files import read_results
+from piccolo.scan import Scan
 from research.synthetic.world import render_picture
 
 PHONE = (Mount(pinhole(1024, 512, 400.0)),)
@@ -76,7 +79,7 @@ def test_a_doubtful_photo_is_sure_beside_another(tmp_path):
     localizer = Localizer((Path("room"),), rooms.AUTO, CloudSettings(), Photo("", camera=cameras), None)
     look = Look(0, before.status, narrow.pano, before.to_json(), (narrow.to_json(),), "1")
     task = localizer.task(photos / "narrow.png")
-    again = localizer.answer_in(rooms.scan(SEED)._opened)(task._replace(look=look))
+    again = localizer.answer_in(rooms.scan(SEED))(task._replace(look=look))
     assert again.result == replace(before, beside=Beside((), "1"))
 
 
@@ -150,7 +153,7 @@ def _sure_by(confidence):
 @pytest.fixture
 def looked(monkeypatch):
     """What is looked at again; b and d are not sure before, and d is not after."""
-    ask, known, looked = OpenedScan.localize, {}, Looked([], {})
+    ask, known, looked = Scan.localize_photo, {}, Looked([], {})
 
     def localize(self, photo, *more, **noted):
         content = photo.path.read_bytes()
@@ -163,13 +166,13 @@ def looked(monkeypatch):
         looked.firsts[photo.path.name] = found.to_json()
         return found
 
-    def localize_again(_self, photo, first, list_pictures, *_):
+    def localize_again(_map, _reader, _workers, photo, first, list_pictures, *_):
         names = tuple(list_pictures())
         looked.asked.append((photo.path.name, [Path(name).name for name in names]))
         return (first, ()) if photo.path.name == "d.jpg" else (replace(first, status="localized"), names[:1])
 
-    monkeypatch.setattr(OpenedScan, "localize", localize)
-    monkeypatch.setattr(OpenedScan, "localize_again", localize_again)
+    monkeypatch.setattr(Scan, "localize_photo", localize)
+    monkeypatch.setattr(localizer_module, "localize_again", localize_again)
     monkeypatch.setattr(Localizer, "place_keypoints", lambda self, scan, line: line)
     return looked
 
@@ -288,7 +291,7 @@ def test_a_look_that_fails_is_told_and_leaves_the_result(
     def localize_again(*_):
         raise OSError(errno.EIO, "Input/output error", "disk")
 
-    monkeypatch.setattr(OpenedScan, "localize_again", localize_again)
+    monkeypatch.setattr(localizer_module, "localize_again", localize_again)
     assert _run(scene, photos, "--out", out, "--quiet") == 1
     assert "disk: cannot be used (Input/output error)" in capsys.readouterr().err
     assert _lines(out.read_text())[1] == ("b.jpg", "ambiguous", None)
@@ -296,7 +299,7 @@ def test_a_look_that_fails_is_told_and_leaves_the_result(
     def stop(*_):
         raise RuntimeError
 
-    monkeypatch.setattr(OpenedScan, "localize_again", stop)
+    monkeypatch.setattr(localizer_module, "localize_again", stop)
     assert _run(scene, photos, "--quiet") == 4
     assert len(_lines(capsys.readouterr().out)) == 3, "lines that waited are not lost"
 
@@ -306,28 +309,29 @@ def test_what_is_looked_at(scene, monkeypatch):
     scan = open_scan(scene / "cloud.ply", cache=False)
     photo = scene / "images" / "clean_0.jpg"
     first = replace(scan.localize(str(photo)), status="ambiguous", **_sure_by(0.5))
-    opened, asked = scan._opened, []
+    asked = []
     other = replace(first, source=replace(first.source, pano_sha256="0"))
 
     def localize_beside(_prepared, _picture, poses, pictures, *_):
         asked.append([pose.key for pose in poses[:1]])
-        return Localization("localized", make_belief([0.93]), first.best_pose), tuple(pictures)
+        return judged("localized", make_belief([0.93]), first.best_pose), tuple(pictures)
 
-    monkeypatch.setattr(opened_scan, "localize_beside", localize_beside)
+    monkeypatch.setattr(second_look, "localize_beside", localize_beside)
 
     def look(before, pictures):
-        return opened.localize_again(Photo(photo), before, lambda: pictures, opened.settings)
+        place = scan.prepared, scan.reader, scan.workers
+        return second_look.localize_again(*place, Photo(photo), before, lambda: pictures, scan.settings)
 
     found, names = look(first, {"x": None})
     assert (found.status, found.confidence, names) == ("localized", 0.93, ("x",))
     assert found.source == first.source
     assert look(replace(first, **_sure_by(0.95)), {"x": None})[1] == (), "it is no surer"
     del asked[1:]
-    assert asked == [[opened.prepared.from_world(first.best_pose).key]]
+    assert asked == [[scan.prepared.from_world(first.best_pose).key]]
     assert look(first, {}) == (first, ())
     assert len(asked) == 2
     assert look(other, {"x": None}) == (other, ())
-    monkeypatch.setattr(opened_scan, "has_guessed_focal", lambda picture: True)
+    monkeypatch.setattr(second_look, "has_guessed_focal", lambda picture: True)
     assert look(first, {"x": None}) == (first, ())
     assert len(asked) == 2
 
@@ -337,27 +341,26 @@ def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypat
     photo = tmp_path / "a.jpg"
     photo.write_bytes((scene / "images" / "clean_0.jpg").read_bytes())
     text = scan.localize(str(photo)).to_json()
-    opened = scan._opened
-    settings = opened.settings, opened.cloud_settings
+    settings = scan.settings, scan.cloud_settings
     localizer = Localizer((scene / "cloud.ply",), *settings, Photo(""), None)
-    located, confidence, gaussian = localizer.place_keypoints(opened, text)
+    located, confidence, gaussian = localizer.place_keypoints(scan, text)
     assert confidence == json.loads(text)["confidence"]
-    in_world = describe_errors(gaussian, scan._opened.prepared.R_map_from_world.T).matrix
+    in_world = describe_errors(gaussian, scan.prepared.R_map_from_world.T).matrix
     np.testing.assert_allclose(in_world, json.loads(text)["covariance"], atol=1e-9)
-    assert located.pose.key == opened.prepared.from_world(Result.from_json(text).best_pose).key
+    assert located.pose.key == scan.prepared.from_world(Result.from_json(text).best_pose).key
     assert len(located.ranges) == len(located.keypoints.rays) > 50
     assert (located.ranges > 0.0).all()
     asked = []
     with monkeypatch.context() as patch:
         patch.setattr(Localizer, "place_keypoints", lambda self, scan, line: asked.append(line))
-        patch.setattr(OpenedScan, "localize_again", lambda self, path, first, found, *_: (first, (*found(),)))
-        answer = localizer.answer_in(opened)
+        patch.setattr(localizer_module, "localize_again", lambda *given: (given[4], (*given[5](),)))
+        answer = localizer.answer_in(scan)
         for beside in ((text, " " + text), (" " + text, "  " + text)):
             answer(localizer.task(photo)._replace(look=Look(0, "ambiguous", str(photo), text, beside, "1")))
     assert [line.count(" {") - text.count(" {") for line in asked] == [0, 1, 1]
     photo.write_bytes((scene / "images" / "clean_1.jpg").read_bytes())
-    assert localizer.place_keypoints(opened, text) is None
+    assert localizer.place_keypoints(scan, text) is None
     photo.unlink()
-    assert localizer.place_keypoints(opened, text) is None
+    assert localizer.place_keypoints(scan, text) is None
     with pytest.raises(InputError, match="photos beside others: not available with the preset paper"):
-        opened.require_default_method("photos beside others", None)
+        scan.require_default_method("photos beside others", None)

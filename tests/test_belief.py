@@ -8,8 +8,9 @@ import pytest
 from piccolo.geometry.pose import Pose
 from piccolo.judge.belief import NOTHING, decide, make_belief
 from piccolo.judge.by_others import Shares, believe_beside, believe_together, share_place
-from piccolo.judge.localization import Alternative, Evidence, Localization
 from piccolo.judge.reasons import WORDS, Contradiction, Reason, explain
+from piccolo.judge.result import Result, nothing_found
+from piccolo.judge.result_parts import Alternative, Evidence
 from piccolo.paper.localize import believe as believe_by_paper
 
 BELIEF = make_belief([0.9, 0.06], within=0.8, doubt=0.05)
@@ -56,7 +57,7 @@ def test_a_status_is_that_of_the_products(places, within, doubt, status):
 
 def test_a_result_has_its_probabilities_by_its_belief():
     here, away = (Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 3.0))
-    judged = Localization(pose=here, alternatives=(Alternative(away, 0.3, 4),))
+    judged = Result(best_pose=here, alternatives=(Alternative(away, 0.3, 4),))
     found = judged.take_belief(make_belief([0.9, 0.06]), 0.9)
     assert (found.status, found.belief) == ("localized", make_belief([0.9, 0.06]))
     told = found.confidence, found.alternatives[0].probability, found.probability_none
@@ -64,7 +65,7 @@ def test_a_result_has_its_probabilities_by_its_belief():
     less = found.take_belief(found.belief.scale(0.5), 0.9)
     told = less.confidence, less.alternatives[0].probability, less.probability_none
     assert (less.status, told) == ("not_localized", pytest.approx((0.45, 0.03, 0.52)))
-    nothing = Localization()
+    nothing = nothing_found()
     assert (nothing.belief, nothing.confidence, nothing.probability_none) == (NOTHING, 0.0, 1.0)
 
 

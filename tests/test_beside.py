@@ -15,8 +15,8 @@ from piccolo.geometry.pose_gaussian import LIKELY, PoseGaussian, subtract
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import NO_CHOICE
-from piccolo.judge.localization import Localization
 from piccolo.judge.reasons import Reason
+from piccolo.judge.result import Result, nothing_found
 from piccolo.local_features.hypotheses import exact_pose
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization.judging import Found
@@ -42,7 +42,7 @@ def test_a_photo_is_localized_beside_one_that_shows_the_same():
     assert found.evidence.num_matches >= 20
     assert rooms.errors(found.pose, _narrow()[1])[0] < 0.03
     assert ask({"bare": SurePhoto(nothing, 0.99, None)}, rooms.UNKNOWN, Workers(2), Stopwatch()) == (
-        Localization(),
+        nothing_found(),
         (),
     )
 
@@ -98,7 +98,7 @@ def test_a_pose_is_averaged_with_that_by_a_photo_beside():
     """By their covariances; not if it is ruled out, nor against a prior."""
     true = _true_pose()
     off = Pose(true.R_cam_from_world, true.center_world + np.array([0.09, 0.0, 0.0]))
-    judged = Localization(belief=make_belief([0.8]), pose=off, gaussian=_at(off, 0.05))
+    judged = Result(belief=make_belief([0.8]), best_pose=off, gaussian=_at(off, 0.05))
     fused = _fused(judged, _at(true, 0.01))
     expected = 0.09 * 0.01**2 / (0.05**2 + 0.01**2)
     assert fused.pose.distance(true) == pytest.approx(expected, rel=0.3)

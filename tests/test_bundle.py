@@ -16,8 +16,9 @@ from piccolo.geometry.pose_gaussian import PoseGaussian, add
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import Selection
-from piccolo.judge.localization import Alternative, Localization
 from piccolo.judge.reasons import Reason
+from piccolo.judge.result import Result, nothing_found
+from piccolo.judge.result_parts import Alternative
 from piccolo.localization.judging import Found
 from piccolo.panorama import Panorama
 from piccolo.together import bundle_search
@@ -47,7 +48,7 @@ def _alone(*probabilities):
     poses = [at(float(k), 0.5) for k in range(len(probabilities))]
     likely = list(zip(poses, probabilities, strict=True))
     alternatives = tuple(Alternative(h.pose, h.score, None, p) for h, p in likely[1:])
-    alone = Localization(belief=make_belief(probabilities), pose=poses[0].pose, alternatives=alternatives)
+    alone = Result(belief=make_belief(probabilities), best_pose=poses[0].pose, alternatives=alternatives)
     found = Found(None, Selection(poses[0], tuple(poses[1:])), None)
     return bundle_search.Member(found, alone, tilted_poses(1, NEAR)[0])
 
@@ -106,9 +107,9 @@ def test_a_certain_place_counts_whole_however_inexact_the_pose_is(std):
     other = make_candidate(3.0, 0.02)
     belief = make_belief([0.99, 0.001], within=0.5)
     gaussian = PoseGaussian(best.pose, np.diag([1e-6] * 3 + [std**2] * 3), np.zeros((6, 6)))
-    alone = Localization(
+    alone = Result(
         belief=belief,
-        pose=best.pose,
+        best_pose=best.pose,
         alternatives=(Alternative(other.pose, other.score),),
         gaussian=gaussian,
         std_of_fit=0.005,
@@ -125,7 +126,7 @@ def test_a_certain_place_counts_whole_however_inexact_the_pose_is(std):
 def test_what_a_photo_rules_out_stays_so_unless_others_know_its_focal_length(conflict, is_measured):
     given = SimpleNamespace(focal_prior=SimpleNamespace(is_measured=is_measured))
     fit = conflict and SimpleNamespace(conflict=conflict)
-    alone = Localization(belief=make_belief([0.9]).rule_out(Reason.MIRRORED), warnings=("mirrored",))
+    alone = Result(belief=make_belief([0.9]).rule_out(Reason.MIRRORED), warnings=("mirrored",))
     member = _alone(0.9)
     found = member.found._replace(problem=replace(PROBLEM, given=given), fit=fit)
     member = replace(member, found=found, alone=alone)
@@ -165,7 +166,7 @@ def test_an_own_pose_far_from_the_one_expected_is_doubted():
 def _members(far):
     """Two photos whose common frame begins `far` [m] from them."""
     cams = [Pose(pose.R_cam_from_world, pose.center_world + far) for pose in tilted_poses(2, NEAR)]
-    return [bundle_search.Member(Found(None, None, None), Localization(), cam) for cam in cams]
+    return [bundle_search.Member(Found(None, None, None), nothing_found(), cam) for cam in cams]
 
 
 @pytest.mark.parametrize("far", [0.0, 1e3])
@@ -261,7 +262,7 @@ def test_photos_are_localized_together_of_which_one_is_not_alone():
     photos, poses = zip(narrow, *_taken(SEED, (1, 7)), strict=True)
     alone = rooms.locate(photos[0], rooms.scan_map(SEED), rooms.KNOWN)
     assert alone.status == "not_localized"
-    assert pose_errors(alone.pose, poses[0])[0] > 1.0
+    assert pose_errors(alone.best_pose, poses[0])[0] > 1.0
     found = _together(photos, _relative(poses))
     assert [f.status for f in found] == ["localized"] * 3
     for f, pose in zip(found, poses, strict=True):

@@ -15,7 +15,7 @@ from piccolo.export.formats import export
 from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.photo import Photo
-from piccolo.result import read_results
+from piccolo.result_files import read_results
 from research.scene import read_scene
 
 COMMON_FROM_WORLD = Pose(exp_so3(np.array([0.3, -0.2, 2.0])), np.array([3.0, -1.0, 2.0]))

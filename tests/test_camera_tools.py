@@ -15,7 +15,7 @@ from piccolo.camera.model import pinhole
 from piccolo.cli import export_poses, localize, render_pose
 from piccolo.geometry.pose import exp_so3
 from piccolo.jobs.threads import Workers
-from piccolo.result import read_results
+from piccolo.result_files import read_results
 from piccolo.views.pictures import cut, sphere_width_for
 from research.evaluation import evaluate
 from research.scene import read_scene

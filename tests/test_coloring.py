@@ -34,8 +34,8 @@ from piccolo.geometry.pose import Pose, pose_errors, step
 from piccolo.jobs.memory import memory_taken
 from piccolo.jobs.threads import Workers
 from piccolo.judge.pose_covariance import PoseCovariance
+from piccolo.judge.result import Result
 from piccolo.panorama import Panorama
-from piccolo.result import Result
 from piccolo.scan_map.scan_map import prepare_map
 
 SEED = 1

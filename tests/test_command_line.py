@@ -23,7 +23,7 @@ from piccolo.cli.settings import cloud_settings_from
 from piccolo.cli.start import COMMANDS
 from piccolo.cloud.settings import BY_FILE, WITHOUT_COLORS, CloudSettings
 from piccolo.errors import InputError, ResourceError, import_optional
-from piccolo.result import Result
+from piccolo.judge.result import Result
 
 SCRIPTS = [ROOT / "localize.py", *sorted((ROOT / "tools").glob("[a-z]*.py"))]
 

@@ -10,9 +10,8 @@ from test_result import POSE, RESULT
 
 from piccolo.geometry.pose import Pose
 from piccolo.judge.belief import make_belief
-from piccolo.judge.localization import Alternative, FocalLength
 from piccolo.judge.pose_covariance import PoseCovariance
-from piccolo.together.walk.results import WalkFrame
+from piccolo.judge.result_parts import Alternative, FocalLength, WalkFrame
 
 SETTINGS = {"preset": "default", "cloud": {}, "panorama": {}}
 SKEW = Pose(np.diag([1.0, 1.0, 1.01]), np.zeros(3))

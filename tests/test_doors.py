@@ -17,15 +17,15 @@ from piccolo import Pose, Result
 from piccolo.cli import localize as localize_command
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import check_pose, exp_so3
-from piccolo.judge.belief import make_belief
+from piccolo.judge import result_parts
+from piccolo.judge.belief import NOTHING, make_belief
 from piccolo.judge.reasons import Reason
+from piccolo.judge.result_parts import Alone, Gap, WalkFrame
 from piccolo.kernels.jit import whole
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama.texels import pack_texels
 from piccolo.photo import GpsPrior
-from piccolo.result import read_results
-from piccolo.together.walk.path import Gap
-from piccolo.together.walk.results import Alone, WalkFrame
+from piccolo.result_files import read_results
 from piccolo.views.zbuffer import nearest_depth, render_view, visible_points
 
 I = np.eye(3)  # noqa: E741
@@ -216,7 +216,7 @@ PROBABILITIES = st.floats(0.0, 1.0)
 MAYBE = {
     "loss": st.none() | PROBABILITIES,
     "probability_none": st.none() | PROBABILITIES,
-    "belief": st.none()
+    "belief": st.just(NOTHING)
     | st.builds(make_belief, st.just([0.5, 0.25]), PROBABILITIES, PROBABILITIES).map(
         lambda belief: belief.rule_out(Reason.NEAR)
     ),
@@ -231,8 +231,8 @@ MAYBE = {
     "gps_prior": st.sampled_from([None, GpsPrior((1.5, -2.0), 30.0, False)]),
     "covariance": st.sampled_from([None, RESULT.covariance]),
     "evidence": st.sampled_from([None, RESULT.evidence]),
-    "beside": st.sampled_from([None, piccolo.result.Beside(("a.jpg", "b.jpg"), "0" * 64)]),
-    "focal_length": st.sampled_from([None, piccolo.result.FocalLength(800.0, 2.0, 810.0, 8.0)]),
+    "beside": st.sampled_from([None, result_parts.Beside(("a.jpg", "b.jpg"), "0" * 64)]),
+    "focal_length": st.sampled_from([None, result_parts.FocalLength(800.0, 2.0, 810.0, 8.0)]),
 }
 
 

@@ -15,7 +15,7 @@ from piccolo.export import rerun_file
 from piccolo.export.formats import export
 from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, exp_so3, uniform_rotations
-from piccolo.result import Source
+from piccolo.judge.result_parts import Source
 
 ORIGIN = np.array([500_000.0, 5_400_000.0, 300.0])
 POSE = Pose(exp_so3(np.array([0.3, -0.2, 1.0])), ORIGIN + np.array([0.2, 0.1, 0.0]))

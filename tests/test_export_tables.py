@@ -14,9 +14,7 @@ from piccolo.errors import InputError
 from piccolo.export.formats import export
 from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, exp_so3, heading_pitch_roll_deg, rotation_from_quaternion_wxyz
-from piccolo.result import Source
-from piccolo.together.walk.path import Gap
-from piccolo.together.walk.results import WalkFrame
+from piccolo.judge.result_parts import Gap, Source, WalkFrame
 
 POSES = tilted_poses(4)
 EYE = np.eye(3)

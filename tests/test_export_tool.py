@@ -17,7 +17,8 @@ from piccolo.cli import export_poses
 from piccolo.errors import InputError
 from piccolo.export.formats import FORMATS
 from piccolo.export.posed_images import select
-from piccolo.result import Source, read_results
+from piccolo.judge.result_parts import Source
+from piccolo.result_files import read_results
 from research.datasets.generic import _table
 
 POSES = tilted_poses(5)

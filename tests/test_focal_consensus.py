@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import rooms
 from pictures import encoded, write
+from poses import judged
 from test_focal_length import DENSE, TRUE
 from test_localize_cameras import SEED, place
 
@@ -20,9 +21,10 @@ from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.conclude import follow_consensus
 from piccolo.judge.consensus import WRONG_SHARE, Consensus, Opinion
-from piccolo.judge.localization import FocalLength, Localization
 from piccolo.judge.reasons import Reason
-from piccolo.result import Result, Source, read_results
+from piccolo.judge.result import Result
+from piccolo.judge.result_parts import FocalLength, Source
+from piccolo.result_files import read_results
 from research.synthetic.world import render_picture
 
 GIVEN = 700.0
@@ -98,7 +100,7 @@ def test_photos_that_confirm_a_calibration_make_all_of_its_poses_surer():
 def _judged(belief, **focal):
     """A result alone by a focal length that was given."""
     focal = FocalLength(700.0, 2.0, 700.0, 2.1, 700.0, 7.0, doubt=belief.doubt, source="`camera`", **focal)
-    return Localization("localized", belief, Pose(np.eye(3), np.zeros(3)), focal_length=focal)
+    return judged("localized", belief, Pose(np.eye(3), np.zeros(3)), focal_length=focal)
 
 
 def test_a_consensus_changes_the_doubt_alone_and_rules_out():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import rooms
 from pictures import encoded, write
+from poses import judged
 from test_localize_cameras import SEED, place, scan
 
 import piccolo
@@ -21,7 +22,7 @@ from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import Selection
-from piccolo.judge.localization import Alternative, Evidence, FocalLength, Localization
+from piccolo.judge.result_parts import Alternative, Evidence, FocalLength
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import localize as module
 from piccolo.localization.calibration import follow_matches, recalibrate
@@ -184,9 +185,10 @@ def test_other_poses_with_other_guesses_share_the_probability():
     settings = rooms.AUTO
     evidence = Evidence(0.5, 1.0, 0.5, 0.9, 0.3)
     here, elsewhere = (Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 3.0))
-    sure = Localization("localized", make_belief([0.95]), here, evidence=evidence)
-    assert select_likeliest([replace(sure, belief=make_belief([0.9])), sure], settings) is sure
-    other = replace(sure, belief=make_belief([0.9]), pose=elsewhere)
+    sure = judged("localized", make_belief([0.95]), here, evidence=evidence)
+    less = judged("localized", make_belief([0.9]), here, evidence=evidence)
+    assert select_likeliest([less, sure], settings) is sure
+    other = replace(less, best_pose=elsewhere)
     doubtful = select_likeliest([sure, other, other], settings)
     assert doubtful.status == "ambiguous"
     assert doubtful.confidence == pytest.approx(0.95**2 / 1.85)
@@ -201,17 +203,19 @@ def test_the_same_place_by_another_focal_length_is_no_alternative_and_none_is_li
     evidence = Evidence(0.5, 1.0, 0.5, 0.9, 0.3)
     ahead, aside = Pose(np.eye(3), np.array([1.0, 0.1, 0.0])), Pose(np.eye(3), np.array([0.0, 1.0, 0.0]))
     first = replace(
-        Localization("localized", make_belief([0.95, 0.02]), Pose(np.eye(3), np.zeros(3)), evidence=evidence),
+        judged("localized", make_belief([0.95, 0.02]), Pose(np.eye(3), np.zeros(3)), evidence=evidence),
         alternatives=(Alternative(aside, 0.4, None, 0.02),),
         focal_length=FocalLength(300.0, 3.0, 300.0, 60.0),
     )
     longer = replace(
-        first, belief=make_belief([0.9, 0.02]), pose=ahead, focal_length=FocalLength(345.0, 3.0, 345.0, 69.0)
+        judged("localized", make_belief([0.9, 0.02]), ahead, evidence=evidence),
+        alternatives=first.alternatives,
+        focal_length=FocalLength(345.0, 3.0, 345.0, 69.0),
     )
     assert select_likeliest([first, longer], settings) is first
     as_long = replace(longer, focal_length=first.focal_length)
     assert select_likeliest([first, as_long], settings).status == "ambiguous"
-    beside = replace(longer, pose=aside)
+    beside = replace(longer, best_pose=aside)
     (rival,) = select_likeliest([first, beside, beside], settings).alternatives
     assert rival.pose is aside
     assert rival.probability == pytest.approx(0.95 * 0.9 / 1.85, rel=0.1)

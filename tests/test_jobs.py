@@ -14,7 +14,8 @@ from piccolo.batch.localizer import Localizer
 from piccolo.cli import execution, localize, settings
 from piccolo.jobs.memory import memory_taken
 from piccolo.jobs.threads import num_cores
-from piccolo.result import Result, read_results
+from piccolo.judge.result import Result
+from piccolo.result_files import read_results
 
 
 @pytest.fixture(scope="module")

@@ -22,9 +22,9 @@ from piccolo.cloud.settings import WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.stream import open_cloud, open_source
 from piccolo.errors import InputError
 from piccolo.geometry.colors import NUM_COLORS, Labels, label_colors, palette
+from piccolo.judge.result import Result
 from piccolo.panorama import read_panorama
 from piccolo.photo import Photo
-from piccolo.result import Result
 from research.evaluation import evaluate
 from research.evaluation.query_result import read_run
 from research.scene import read_scene

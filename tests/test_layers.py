@@ -26,10 +26,12 @@ LAYERS = [
     "batch",
     "opening",
     "scan",
-    "coloring",
     "scan_walk",
-    "opened_scan",
-    "result",
+    "second_look",
+    "photo_reader",
+    "coloring",
+    "result_photo",
+    "result_files",
     "together",
     "localization",
     "paper",
@@ -138,9 +140,9 @@ def test_one_module_makes_statuses():
         return {path for path, node in calls if node.func.id == name}
 
     assert find_callers("classify") == {"judge/belief.py"}
-    assert find_callers("decide") == {"judge/localization.py"}
-    results = [node for _, node in calls if node.func.id == "Localization"]
-    assert len(results) > 5
+    assert find_callers("decide") == {"judge/result.py"}
+    results = [node for path, node in calls if node.func.id == "Result" and path != "photo_reader.py"]
+    assert len(results) > 2
     assert not any(node.args or "status" in [k.arg for k in node.keywords] for node in results)
 
 

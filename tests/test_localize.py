@@ -22,9 +22,9 @@ from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli import execution, localize, prepare_map
 from piccolo.judge.belief import make_belief
-from piccolo.judge.localization import FocalLength
 from piccolo.judge.reasons import Reason
-from piccolo.result import Result
+from piccolo.judge.result import Result
+from piccolo.judge.result_parts import FocalLength
 from research.scene import read_scene
 
 PAPER = ["--preset", "paper", "num_translations=30", "num_iterations=60", "max_points=30000"]

@@ -19,9 +19,10 @@ from piccolo.camera.model import Camera, pinhole
 from piccolo.cli.localize import main
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
+from piccolo.judge.result import Result
 from piccolo.panorama import read_panorama
 from piccolo.photo import Photo
-from piccolo.result import Result, read_results
+from piccolo.result_files import read_results
 from research.synthetic.world import make_query, photograph, picture_of_all, pose_of_query, render_picture
 
 BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))

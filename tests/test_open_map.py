@@ -303,7 +303,7 @@ def test_a_map_file_without_them_makes_them_too(tmp_path, finding):
 
 def test_a_scan_of_arrays_is_opened_without_them(finding):
     scan = open_scan(Cloud(rooms.points_world(1), colors=rooms.room(1)[1].colors), num_threads=2)
-    assert scan._opened.prepared.lacks_features
+    assert scan.prepared.lacks_features
     assert finding == []
     scan.localize(rooms.query(1).rgb, gravity="unknown")
     assert finding == [1]

@@ -137,14 +137,14 @@ def test_las_names_its_system(tmp_path):
 def test_a_position_becomes_a_prior_of_any_height():
     x, y = 512_345.0, 5_403_210.0
     longitude, latitude = Transformer.from_crs(UTM, "EPSG:4326", always_xy=True).transform(x, y)
-    opened = replace(rooms.scan(1)._opened, cloud_settings=CloudSettings(crs=UTM))
-    prior = opened.make_gps_prior(
+    reader = replace(rooms.scan(1), cloud_settings=CloudSettings(crs=UTM)).reader
+    prior = reader.make_gps_prior(
         PhotoFacts("", (1, 1), None, GpsPosition(latitude, longitude, 4.0)), Prior()
     )
     assert prior.center_world == pytest.approx((x, y), abs=1e-3)
     assert (prior.radius, prior.is_used) == (15.0, True)
     rough = PhotoFacts("", (1, 1), None, GpsPosition(latitude, longitude, None))
-    assert opened.make_gps_prior(rough, Prior()).radius == 30.0
+    assert reader.make_gps_prior(rough, Prior()).radius == 30.0
     near = prior.apply_to(Prior(height=(1.0, 2.0)))
     assert near.near == (*prior.center_world, None)
     assert near.height == (1.0, 2.0)

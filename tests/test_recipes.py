@@ -27,7 +27,7 @@ from piccolo.export.formats import export, tum_lines
 from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.judge.pose_covariance import PoseCovariance
-from piccolo.result import read_results
+from piccolo.result_files import read_results
 
 RECIPES = sorted((ROOT / "docs" / "recipes").glob("*.md"))
 SEED = 3

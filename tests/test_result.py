@@ -10,11 +10,13 @@ from refusals import assert_input_error
 
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.judge.belief import make_belief
-from piccolo.judge.localization import Alternative, Evidence
 from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.judge.reasons import Reason
+from piccolo.judge.result import Result
+from piccolo.judge.result_parts import Alternative, Evidence, Source
+from piccolo.photo_reader import unreadable_result
 from piccolo.report.site import NOT_TOLD
-from piccolo.result import Result, Source, read_results, unreadable_result
+from piccolo.result_files import read_results
 
 ROOT = Path(__file__).resolve().parents[1]
 POSE = Pose(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([500_000.123, 4_000_000.456, 12.0]))

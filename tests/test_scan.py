@@ -94,8 +94,8 @@ def test_a_scan_is_known_by_its_bytes(tmp_path, scan):
     np.savetxt(path, np.hstack([cloud.points[::50], cloud.colors[::50]]), fmt="%.3f")
     expected = hashlib.sha256(path.read_bytes()).hexdigest()
     for options in ({"cache": False}, {"settings": PaperSettings()}):
-        assert piccolo.open_scan(path, **options)._opened.prepared.scan_sha256 == expected
-    digest = scan._opened.prepared.scan_sha256
+        assert piccolo.open_scan(path, **options).prepared.scan_sha256 == expected
+    digest = scan.prepared.scan_sha256
     assert digest == sha256_of_arrays(cloud.points + cloud.origin_world, cloud.colors)
     assert len({digest, sha256_of_arrays(cloud.points), sha256_of_arrays(cloud.points.T.copy())}) == 3
 
@@ -164,8 +164,8 @@ def test_a_saved_scan_gives_the_same_bits(tmp_path, scan):
     assert again.pose.key == result.pose.key
     assert (again.confidence, again.loss) == (result.confidence, result.loss)
     assert np.array_equal(again.covariance.matrix, result.covariance.matrix)
-    partial_map = dataclasses.replace(scan._opened.prepared, is_partial=True)
-    partial = piccolo.Scan(dataclasses.replace(scan._opened, prepared=partial_map))
+    partial_map = dataclasses.replace(scan.prepared, is_partial=True)
+    partial = dataclasses.replace(scan, prepared=partial_map)
     assert_input_error("prepared within `near` only", partial.save, tmp_path / "part.map")
     cloud = rooms.room(1)[1]
     paper = piccolo.open_scan(piccolo.Cloud(cloud.points, colors=cloud.colors), settings=PaperSettings())
@@ -175,7 +175,7 @@ def test_a_saved_scan_gives_the_same_bits(tmp_path, scan):
 
 def test_each_of_many_photos_has_its_own_options_and_prior(tmp_path, scan):
     settings = CoarseToFineSettings(prior=Prior(height=(1.0, 2.0)), gravity="known")
-    opened = piccolo.Scan(dataclasses.replace(scan._opened, settings=settings))
+    opened = dataclasses.replace(scan, settings=settings)
     own = Prior(near=(1.0, 2.0, None), radius=3.0)
     photos = [
         piccolo.Photo(tmp_path / "a.jpg", gravity_vector=np.array([0.0, 0.0, -1.0])),

@@ -14,7 +14,7 @@ from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.stream import FORMATS
 from piccolo.geometry.colors import srgb_to_linear
 from piccolo.geometry.pose import Pose
-from piccolo.result import Result
+from piccolo.judge.result import Result
 from research.scene import read_scene
 
 UNTURNED = np.eye(3)

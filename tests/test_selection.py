@@ -12,8 +12,8 @@ from piccolo.evidence.examine import complete, count_agreeing, examine
 from piccolo.geometry.pose import step
 from piccolo.jobs.threads import Workers
 from piccolo.judge.candidate import Selection
-from piccolo.judge.localization import Localization
 from piccolo.judge.probability import Standing
+from piccolo.judge.result import nothing_found
 from piccolo.judge.selection import assess, credit_copies, list_drawn, select
 from piccolo.localization import last_descent
 from piccolo.localization.attempts import end_search
@@ -245,7 +245,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere():
     alone = judged(best)
     assert (alone.evidence.margin, alone.evidence.alternative_matches) == (1.0, 0)
     nothing = pack_texels(panorama.rgb, np.zeros_like(panorama.is_valid))
-    assert judged(best, asked=replace(problem, colors=lambda: nothing)) == Localization()  # no point is seen
+    assert judged(best, asked=replace(problem, colors=lambda: nothing)) == nothing_found()  # no point is seen
 
 
 @pytest.mark.parametrize(("count", "expected"), [(12, 2), (11, 6)])

@@ -19,10 +19,10 @@ from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.pose_gaussian import probability_of_ball
 from piccolo.geometry.sphere import compute_pixels
 from piccolo.judge.claim import Claim, marginal
+from piccolo.judge.result import Result
 from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.optimize.self_calibration import sum_free_equations
 from piccolo.panorama.texels import pack_texels
-from piccolo.result import Result
 
 SEED = 5
 LENSES = {

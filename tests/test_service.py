@@ -19,8 +19,8 @@ from batches import workers_of
 from services import serving
 
 from piccolo.cli import localize
+from piccolo.judge.result import Result
 from piccolo.photo import Photo, Prior
-from piccolo.result import Result
 from piccolo.service.asking import clean_name
 from piccolo.service.description import describe_service
 

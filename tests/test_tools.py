@@ -16,10 +16,10 @@ from rooms import write_room
 
 from piccolo.geometry.pose import Pose
 from piccolo.judge.pose_covariance import PoseCovariance
+from piccolo.judge.result import Result
 from piccolo.panorama import read_panorama
 from piccolo.paper.localize import PaperSettings
 from piccolo.problem.method import METHOD
-from piccolo.result import Result
 from research.evaluation.query_result import QueryResult
 from research.measuring import benchmark, confidence, page, sensitivity, speed
 from research.scene import Query, read_scene, write_queries

@@ -19,10 +19,10 @@ from piccolo.export.formats import tum_lines
 from piccolo.geometry.pose import Pose, carry, pose_errors, yaw_rotation
 from piccolo.jobs import memory
 from piccolo.jobs.threads import Workers
-from piccolo.judge.localization import Localization
+from piccolo.judge.result import nothing_found
 from piccolo.panorama import picture
 from piccolo.photo import Photo
-from piccolo.result import read_results
+from piccolo.result_files import read_results
 from piccolo.scan_walk import Walk
 from piccolo.together.walk import tracker as tracker_module
 from research.synthetic.walk_frames import writing_video
@@ -147,7 +147,7 @@ def test_photos_in_any_order_are_each_searched_in_the_whole_scan(scan, queries):
 def test_a_camera_is_searched_everywhere_as_soon_as_it_may_be_elsewhere(scan, queries, tmp_path, monkeypatch):
     """The first frame can't be read; the second is searched, and as it is lost, again 2.3 m and 6.3 m on."""
     localize = tracker_module.localize
-    monkeypatch.setattr(tracker_module, "localize", lambda *_: Localization())
+    monkeypatch.setattr(tracker_module, "localize", lambda *_: nothing_found())
     walk = scan.track(motion=piccolo.Motion(max_speed=1.0), gravity="known")
     walk.add(tmp_path / "missing.jpg", 0.0)
     noise = np.random.default_rng(1).integers(0, 255, (256, 512, 3), dtype=np.uint8)

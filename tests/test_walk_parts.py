@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import rooms
 from pictures import encoded, write
+from poses import judged
 from refusals import assert_input_error
 from test_priors import write_photo
 
@@ -18,8 +19,9 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
 from piccolo.geometry.pose_gaussian import PoseGaussian, probability_within
 from piccolo.judge.belief import make_belief
-from piccolo.judge.localization import Alternative, Evidence, Localization
 from piccolo.judge.reasons import Reason
+from piccolo.judge.result import Result, nothing_found
+from piccolo.judge.result_parts import Alternative, Evidence
 from piccolo.photo import Photo
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.together.walk.frames import MOST_ODDS, Frame, State, list_states
@@ -113,11 +115,11 @@ def test_an_odometry_of_another_length_is_named(factor, noise, words):
     centers = np.cumsum(rng.normal(size=(200, 3)) * [0.4, 0.4, 0.0], axis=0)
     frames = [Frame(float(k), odometry=Pose(TURN, factor * c)) for k, c in enumerate(centers)]
     seen = [Pose(TURN, c + noise * rng.normal(size=3)) for c in centers]
-    found = [Localization("localized", pose=pose) for pose in seen]
-    found[7] = Localization("localized", pose=Pose(TURN, centers[7] + 9.0))
+    found = [Result("localized", best_pose=pose) for pose in seen]
+    found[7] = Result("localized", best_pose=Pose(TURN, centers[7] + 9.0))
     assert check_odometry(frames, found) == words
     assert check_odometry(frames[:3], found[:3]) == ()
-    lost = [Localization(pose=pose) for pose in seen]
+    lost = [Result(best_pose=pose) for pose in seen]
     assert check_odometry(frames, lost) == ()
 
 
@@ -125,7 +127,7 @@ def _judged(belief):
     """A frame that was localized alone, with one alternative."""
     evidence = Evidence(0.5, 1.0, 0.5, 0.9, 0.3)
     away = Alternative(Pose(TURN, np.array([3.0, 0.0, 0.0])), 0.3)
-    return Localization("localized", belief, Pose(TURN, np.zeros(3)), evidence=evidence, alternatives=(away,))
+    return judged("localized", belief, Pose(TURN, np.zeros(3)), evidence=evidence, alternatives=(away,))
 
 
 def test_the_states_of_a_frame_have_the_odds_of_places_however_exact_the_pose_is():
@@ -141,7 +143,7 @@ def test_the_states_of_a_frame_have_the_odds_of_places_however_exact_the_pose_is
     assert [state.log_odds for state in certain] == [MOST_ODDS, pytest.approx(0.0)]
     refused = _judged(make_belief([0.9, 0.05]).rule_out(Reason.MIRRORED))
     assert {state.log_odds for state in list_states(scan_map, refused)} == {-2.0 * MOST_ODDS}
-    assert list_states(scan_map, Localization()) == []
+    assert list_states(scan_map, nothing_found()) == []
 
 
 @pytest.mark.parametrize("std", [0.01, 0.08])

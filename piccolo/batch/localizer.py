@@ -27,21 +27,24 @@ from ..jobs.processes import WorkerLostError
 from ..jobs.threads import Workers
 from ..judge.conclude import follow_consensus
 from ..judge.consensus import Consensus
-from ..judge.localization import FocalLength
 from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
+from ..judge.result import Result
+from ..judge.result_parts import Beside, FocalLength, Source
 from ..judge.sure import SURE_CONFIDENCE
 from ..localization.means import Step, Trace
-from ..opened_scan import OpenedScan, Settings, make_failed_result, settings_json
 from ..opening import open_files
 from ..photo import Photo, Vector
+from ..photo_reader import Settings, settings_json, unreadable_result
 from ..problem.settings import CoarseToFineSettings
-from ..result import Beside, Result, Source, localization_of, unreadable_result, with_localization
+from ..scan import Scan
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
+from ..second_look import localize_again, place_keypoints
 from ..together.beside import SurePhoto
 from ..views.pictures import encode_image, overlay_png
 from .inputs import PriorTable
 
+BESIDE = "photos beside others"
 MOST_PICTURES = 200  # beside which a photo is looked at again
 BETTER = 0.7  # others' deviation must be below this fraction of the photo's own
 ONE_CAMERA = 1.02  # largest ratio of neighbouring given focal lengths of one camera: focusing changes them
@@ -105,9 +108,7 @@ def list_changed_by_consensus(texts: Sequence[str], min_confidence: float) -> li
             continue
         for k, _ in camera:
             before = results[k]
-            after = with_localization(
-                before, follow_consensus(localization_of(before), consensus, min_confidence)
-            )
+            after = follow_consensus(before, consensus, min_confidence)
             after = replace(after, warnings=tuple(dict.fromkeys(after.warnings)))
             is_other = after.status != before.status or after.warnings != before.warnings
             if is_other or abs(after.confidence - before.confidence) > TOLD_CHANGE:
@@ -275,28 +276,26 @@ class Localizer:
         """Open the scan in this process; return what answers tasks."""
         return self.answer_in(self.open_here())
 
-    def open_here(self) -> OpenedScan:
+    def open_here(self) -> Scan:
         """Open the scan with a process's own threads and memory."""
         limit_memory(self.max_memory)
         return self.open_scan(Workers(self.num_threads))
 
-    def answer_in(self, scan: OpenedScan) -> Callable[[Task], Answer]:
+    def answer_in(self, scan: Scan) -> Callable[[Task], Answer]:
         """Return what answers tasks in an opened scan."""
         return partial(self.answer, scan, lru_cache(MOST_PICTURES)(partial(self.place_keypoints, scan)))
 
-    def open_scan(self, workers: Workers) -> OpenedScan:
+    def open_scan(self, workers: Workers) -> Scan:
         """Read and prepare the scan."""
         if self.map_name:
             path = Path(self.map_name)
             scan_map = load_map(path if path.is_absolute() else find_sent_file(self.map_name))
-            return OpenedScan(scan_map, self.name, self.cloud_settings, self.settings, workers, {})
+            return Scan(scan_map, self.name, self.cloud_settings, self.settings, workers, {})
         paths = [self.folder / path for path in self.paths]
         scan = open_files(paths, self.cloud_settings, self.settings, self.cache, workers)
         return replace(scan, name=self.name)
 
-    def answer(
-        self, scan: OpenedScan, place_keypoints: Callable[[str], SurePhoto | None], task: Task
-    ) -> Answer:
+    def answer(self, scan: Scan, place_keypoints: Callable[[str], SurePhoto | None], task: Task) -> Answer:
         """Localize one photo, and make the pictures asked for; of one that can't be read say why.
 
         `place_keypoints` returns a photo that is sure by its result's JSON.
@@ -306,22 +305,24 @@ class Localizer:
         with task.place(self.folder) as photo, reading_once():
             try:
                 if task.look is None:
-                    found = scan.localize(photo, task.settings, trace=trace)
+                    found = scan.localize_photo(photo, task.settings, trace=trace)
                 else:
                     found = look_again(scan, photo, task.settings, task.look, place_keypoints)
                 overlay, mask = self._pictures(scan, photo, found)
             except Exception as error:
-                return Answer(make_failed_result(scan, photo, error, task.settings, name))
+                return Answer(scan.reader.make_failed(photo, error, task.settings, name))
         warnings = tuple(warning.replace(photo.name, name) for warning in found.warnings)
         result = replace(found, pano=name, warnings=warnings)
         return Answer(result, warnings[len(scan.warnings) :], overlay, mask, tuple(trace.steps))
 
-    def place_keypoints(self, scan: OpenedScan, line: str) -> SurePhoto | None:
+    def place_keypoints(self, scan: Scan, line: str) -> SurePhoto | None:
         """Return a photo that is sure, by the JSON of its result; None if it is another or none any more."""
         result = Result.from_json(line)
         photo, settings = self.ask(Path(result.pano))
         try:
-            return scan.place_keypoints(replace(photo, picture=self.folder / photo.path), result, settings)
+            photo = replace(photo, picture=self.folder / photo.path)
+            scan_map, settings = scan.require_default_method(BESIDE, settings)
+            return place_keypoints(scan_map, scan.reader, scan.workers, photo, result, settings)
         except (OSError, InputError) as error:
             if is_passing(error):
                 raise
@@ -334,7 +335,7 @@ class Localizer:
         about = {"settings": settings, "source": Source(cloud_sha256)}
         return Answer(unreadable_result(f"{name}: {error}", self.name, name, is_passing=True, **about))
 
-    def _pictures(self, scan: OpenedScan, photo: Photo, result: Result) -> tuple[bytes | None, bytes | None]:
+    def _pictures(self, scan: Scan, photo: Photo, result: Result) -> tuple[bytes | None, bytes | None]:
         """Overlay and occlusion mask as PNG, where they are asked for and there is a pose."""
         overlay = mask = None
         pose = result.best_pose
@@ -343,14 +344,14 @@ class Localizer:
         photo = photo.with_refined_camera(result.cameras)
         if self.makes_overlays:
             local = scan.prepared.from_world(pose)
-            overlay = overlay_png(scan.prepared.points, scan.read(photo), local, scan.workers)
+            overlay = overlay_png(scan.prepared.points, scan.reader.read(photo), local, scan.workers)
         if self.makes_occlusion_masks:
             mask = encode_image(scan.occlusion_mask(photo, pose), ".png")
         return overlay, mask
 
 
 def look_again(
-    scan: OpenedScan,
+    scan: Scan,
     photo: Photo,
     settings: Settings,
     look: Look,
@@ -362,8 +363,9 @@ def look_again(
         found = ((json.loads(line)["pano"], place_keypoints(line)) for line in look.beside)
         return {name: picture for name, picture in found if picture}
 
-    first = Result.from_json(look.first) if look.first else scan.localize(photo, settings, look.focal)
+    first = Result.from_json(look.first) if look.first else scan.localize_photo(photo, settings, look.focal)
     if not look.beside:
         return replace(first, beside=None)
-    found, names = scan.localize_again(photo, first, list_pictures, settings)
+    scan_map, settings = scan.require_default_method(BESIDE, settings)
+    found, names = localize_again(scan_map, scan.reader, scan.workers, photo, first, list_pictures, settings)
     return replace(found, beside=Beside(names, look.asked_sha256))

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from ..errors import InputError
 from ..files.line_file import LineFile, whole_lines, whole_size
-from ..result import FAILED, FORMAT
+from ..judge.result import FAILED, FORMAT
 from .localizer import may_change
 
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()

@@ -15,10 +15,9 @@ from ..geometry.pose import orthonormal, rotation_to_z, yaw_rotation
 from ..gravity.alignment import MAX_LEAN, dot, find_up, level, wall_yaw
 from ..jobs.threads import Workers, num_cores
 from ..judge.probability import LOCALIZED
-from ..opened_scan import OpenedScan
 from ..panorama import read_panorama
-from ..photo import Photo
 from ..problem.settings import CoarseToFineSettings
+from ..scan import Scan
 from ..scan_map.scan_map import prepare_map
 from .command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from .options import add_cloud_options
@@ -80,8 +79,8 @@ def find_up_by_photo(photo: Path, cloud: CloudStream, axis: Array) -> tuple[Arra
     workers = Workers(num_cores(), cloud.show)
     settings = CoarseToFineSettings(gravity="unknown")
     scan_map = prepare_map(cloud, workers, rotation_to_z(axis))
-    scan = OpenedScan(scan_map, cloud.label, CloudSettings(), settings, workers, {})
-    result = scan.localize(Photo(photo), settings)
+    scan = Scan(scan_map, cloud.label, CloudSettings(), settings, workers, {})
+    result = scan.localize(photo)
     up = result.pose.R_cam_from_world[2] if result.pose and result.status == LOCALIZED else None
     return up, f"{photo} is {result.status}"
 

@@ -7,7 +7,7 @@ import numpy as np
 from ..export.model_alignment import file_of_poses, fit_alignment, write_aligned, write_matrix
 from ..files.atomic import check_output, check_output_folder
 from ..geometry.pose import quaternion_wxyz
-from ..result import read_results
+from ..result_files import read_results
 from .command import Arguments, check_distinct, command, option
 
 EPILOG = """\

@@ -17,7 +17,8 @@ from ..batch.relative_poses import warn_of_axes
 from ..errors import InputError
 from ..files.photo_names import match_names
 from ..geometry.pose import CAMERA_AXES, OPTICAL_FROM_CAM, Pose, angle_between, log_so3, quaternion_wxyz
-from ..result import Result, read_results
+from ..judge.result import Result
+from ..result_files import read_results
 from .command import Arguments, UsageError, check_outputs, check_suffix, command, option
 
 ALIKE_DEG = 20.0  # chosen: no camera that is mounted otherwise is turned about this axis by 100 to 140 deg

@@ -5,7 +5,8 @@ from argparse import ArgumentParser
 from ..coloring.color_scan import check_suffix, write_colored_scan
 from ..opening import open_files
 from ..problem.settings import CoarseToFineSettings
-from ..result import read_results
+from ..result_files import read_results
+from ..scan_map.scan_map import ScanMap
 from .command import Arguments, check_outputs, checking_options, command, option
 from .options import CACHE_TEXT, add_cloud_options
 from .settings import cache_from, cloud_settings_from
@@ -42,7 +43,10 @@ def main(arguments: Arguments) -> int:
     method = CoarseToFineSettings()
     scan = open_files(arguments.cloud, settings, method, cache_from(arguments), arguments.workers())
     arguments.warn(scan.warnings)
-    colored = write_colored_scan(scan, results, arguments.out)
+    assert isinstance(scan.prepared, ScanMap)
+    colored = write_colored_scan(
+        arguments.cloud, scan.prepared, settings, results, arguments.out, scan.workers
+    )
     line = {"out": str(arguments.out), "photos": colored.num_photos, "points": colored.num_points}
     line["colored_points"] = colored.num_colored
     arguments.report({}, line)

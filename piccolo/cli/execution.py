@@ -21,9 +21,9 @@ from ..jobs.memory import GB, memory_left, memory_taken
 from ..jobs.processes import Here, Processes, WorkerLostError
 from ..jobs.threads import num_cores
 from ..judge.probability import AMBIGUOUS, LOCALIZED
+from ..judge.result import FAILED, UNREADABLE, Result
 from ..judge.sure import WORTH_A_LOOK
-from ..opened_scan import OpenedScan
-from ..result import FAILED, UNREADABLE, Result
+from ..scan import Scan
 from ..scan_map.map_file import save_map
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.scan_map import ScanMap
@@ -47,7 +47,7 @@ def choose_exit_code(statuses: Collection[str]) -> int:
 
 def advise(result: Result) -> list[str]:
     """Return a line on what to do about a doubtful result; none if a warning says why nothing is certain."""
-    is_ruled_out = result.best_pose is None or (result.belief is not None and result.belief.ruled_out)
+    is_ruled_out = result.best_pose is None or result.belief.ruled_out
     if result.status == LOCALIZED or is_ruled_out or result.settings.get("preset") == "paper":
         return []
     focal = result.focal_length
@@ -125,7 +125,7 @@ def executing(
     localizer: Localizer,
     num_jobs: int,
     cluster: Cluster | None,
-    open_scan: Callable[[Localizer, int], OpenedScan],
+    open_scan: Callable[[Localizer, int], Scan],
 ) -> Iterator[tuple[Executor, Localizer]]:
     """Yield an executor, and the localizer for it; `open_scan` prepares the scan, with so many threads."""
     is_kept = localizer.cache.is_used
@@ -149,7 +149,7 @@ def executing(
 
 
 def at_the_workers(
-    arguments: Arguments, cluster: Cluster, localizer: Localizer, scan: OpenedScan, is_kept: bool
+    arguments: Arguments, cluster: Cluster, localizer: Localizer, scan: Scan, is_kept: bool
 ) -> Localizer:
     """Return a localizer whose scan a cluster's workers can open: at its path, or sent to them."""
     here = Path.cwd()

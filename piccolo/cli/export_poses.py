@@ -13,7 +13,8 @@ from ..export.posed_images import Options, Selection, offset_file, select
 from ..export.reconstructions import points_file
 from ..export.scan_points import open_scan_of
 from ..geometry.pose import CAMERA_AXES
-from ..result import Result, check_scan, read_results
+from ..judge.result import Result
+from ..result_files import check_scan, read_results
 from ..scan_map.open_map import CachePolicy, scan_sha256_of
 from .command import Arguments, check_distinct, checking_options, command, option
 

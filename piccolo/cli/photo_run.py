@@ -23,16 +23,15 @@ from ..files.line_file import open_locked, write_line
 from ..jobs.memory import limit_memory
 from ..jobs.threads import Stopwatch, num_cores
 from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
-from ..opened_scan import OpenedScan
+from ..judge.result import FAILED, UNREADABLE
 from ..panorama import read_panorama
 from ..panorama.cube import is_cube
 from ..panorama.masks import find_mask
 from ..panorama.photo import sha256_of
 from ..problem.settings import CoarseToFineSettings
-from ..result import FAILED, UNREADABLE
+from ..scan import Scan
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
-from ..scan_walk import Walk
 from ..views.pictures import encode_image
 from . import execution, terminal, together
 from .command import Arguments, UsageError, check_distinct, check_suffix, checking_options
@@ -140,7 +139,7 @@ def note_unused_priors(arguments: Arguments, localizer: Localizer) -> None:
         arguments.note(f"warning: {priors.path}: {note}")
 
 
-def open_scan(run: Run, localizer: Localizer, num_threads: int) -> OpenedScan:
+def open_scan(run: Run, localizer: Localizer, num_threads: int) -> Scan:
     """Read and prepare the scan."""
     workers = run.arguments.workers(num_threads)
     scan = localizer.open_scan(workers)
@@ -328,8 +327,9 @@ def run_jointly(run: Run) -> int:
         with together.walk_frames(arguments, run.localizer.photo, photos) as (frames, motion):
             if run.left_out:
                 arguments.note(describe_left_out(run.left_out))
-            walk = Walk(opening(), settings, motion)
-            return together.run_together(arguments, together.make_walk_job(arguments, frames, walk))
+            scan = opening()
+            job = together.make_walk_job(arguments, frames, scan, scan.track(motion=motion))
+            return together.run_together(arguments, job)
     make_job = together.make_bundle_job if arguments.relative else together.make_coloring_job
     return together.run_together(arguments, make_job(arguments, photos, run.localizer, opening()))
 

@@ -8,11 +8,12 @@ from typing import Any, get_args, get_type_hints
 from ..batch.localizer import Localizer
 from ..cloud.settings import CloudSettings
 from ..errors import InputError
-from ..opened_scan import ONLY_DEFAULT, Settings
 from ..panorama import check_labels
 from ..paper.localize import PaperSettings
 from ..photo import NOTHING_KNOWN, Photo, Prior
+from ..photo_reader import Settings
 from ..problem.settings import CoarseToFineSettings
+from ..scan import ONLY_DEFAULT
 from ..scan_map.open_map import CachePolicy
 from .command import Arguments
 from .options import NONE

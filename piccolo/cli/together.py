@@ -26,11 +26,12 @@ from ..geometry.pose import Pose
 from ..jobs.processes import InFlight
 from ..jobs.threads import Stopwatch
 from ..judge.probability import LOCALIZED
-from ..opened_scan import OpenedScan
+from ..judge.result import FAILED, UNREADABLE, Result
 from ..panorama.photo import sha256_of
 from ..panorama.video import frames_of_chapters
 from ..photo import Photo
-from ..result import FAILED, UNREADABLE, Result, read_results
+from ..result_files import read_results
+from ..scan import Scan
 from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
 from ..together.walk.frames import Motion
@@ -135,9 +136,7 @@ def is_finished(out: Path, job: Job) -> bool:
     return not list(records.remaining(paths, lambda name: sha256_of(*paths[name]))) and records.is_in_order
 
 
-def make_bundle_job(
-    arguments: Arguments, photos: Sequence[Path], localizer: Localizer, scan: OpenedScan
-) -> Job:
+def make_bundle_job(arguments: Arguments, photos: Sequence[Path], localizer: Localizer, scan: Scan) -> Job:
     """Return the job of localizing photos as one camera, by --relative; a stopped one begins again."""
     poses = read_relative_poses(arguments.relative, photos)
     more = {"relative_sha256": sha256_of(arguments.relative, None)}
@@ -147,7 +146,8 @@ def make_bundle_job(
     def run(_journal: Journal) -> list[Result]:
         scale = find_scale(arguments.relative)
         of_all = [pose for _, pose in posed]
-        found = iter(scan.localize_bundle([photo for photo, _ in posed], of_all, localizer.settings, scale))
+        given = [photo for photo, _ in posed]
+        found = iter(scan.localize_bundle(given, of_all, relative_scale=scale))
         answer = localizer.answer_in(scan)
         pairs = zip(photos, poses, strict=True)
         # a photo that structure from motion did not register is localized alone
@@ -163,9 +163,7 @@ def make_bundle_job(
     return Job("photos together", {photo.name: photo for photo in asked}, fields, run, report)
 
 
-def make_coloring_job(
-    arguments: Arguments, photos: Sequence[Path], localizer: Localizer, scan: OpenedScan
-) -> Job:
+def make_coloring_job(arguments: Arguments, photos: Sequence[Path], localizer: Localizer, scan: Scan) -> Job:
     """Return the job of localizing photos in the colours of the others, and of colouring the scan by them.
 
     If too few are localized to colour the scan, the results alone are written.
@@ -197,7 +195,9 @@ def make_coloring_job(
         least = color_scan.LEAST_COLORING_PHOTOS
         if sum(result.status == LOCALIZED for result in results) < least:
             return f"; {arguments.color_scan} is not written: wanted {least} localized photos or more", False
-        colored = color_scan.write_colored_scan(scan, results, arguments.color_scan)
+        colored = color_scan.write_colored_scan(
+            localizer.paths, scan_map, scan.cloud_settings, results, arguments.color_scan, scan.workers
+        )
         part = 100.0 * colored.num_colored / max(colored.num_points, 1)
         return f"; {part:.0f} % of the points coloured", True
 
@@ -244,7 +244,7 @@ def walk_frames(
         yield frames, Motion(max_speed=arguments.max_speed, is_timed=is_timed)
 
 
-def make_walk_job(arguments: Arguments, frames: Sequence[WalkInput], walk: Walk) -> Job:
+def make_walk_job(arguments: Arguments, frames: Sequence[WalkInput], scan: Scan, walk: Walk) -> Job:
     """Return the job of localizing the frames of a walk."""
     if arguments.odometry:
         walk.more_settings["odometry_sha256"] = sha256_of(arguments.odometry, None)
@@ -257,14 +257,14 @@ def make_walk_job(arguments: Arguments, frames: Sequence[WalkInput], walk: Walk)
     def report(results: Sequence[Result]) -> tuple[str, bool]:
         arguments.warn({w for r in results for w in r.warnings if w.startswith("`odometry`")})
         if arguments.video and not (arguments.max_speed or arguments.quiet):
-            arguments.warn(suggest_speed(walk, results))
+            arguments.warn(suggest_speed(scan, walk, results))
         gaps = sum(result.walk is not None and result.walk.gap is not None for result in results)
         return f"; {gaps} gaps", True
 
     return Job("frames", {frame.name: frame.photo for frame in frames}, lambda _: fields, run, report)
 
 
-def suggest_speed(walk: Walk, results: Sequence[Result]) -> list[str]:
+def suggest_speed(scan: Scan, walk: Walk, results: Sequence[Result]) -> list[str]:
     """Return a warning if many frames were not found, and one of them is, alone, but beyond reach."""
     lost = [k for k, r in enumerate(results) if r.pose is None and r.error is None and not is_tracked(r)]
     sure = [(r.walk.time, r.pose) for r in results if r.walk and r.pose]
@@ -272,7 +272,7 @@ def suggest_speed(walk: Walk, results: Sequence[Result]) -> list[str]:
         return []
     k = lost[len(lost) // 2]
     own = results[k].walk
-    pose = walk.scan.localize(walk.photos[k], walk.tracker.settings).pose
+    pose = scan.localize(walk.photos[k]).pose
     if own is None or pose is None:
         return []
     time, other = min(sure, key=lambda at: abs(at[0] - own.time))

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..arrays import Array, Array32, Bytes, Int32s
 from ..cloud.octree import Octree, recolor
+from ..cloud.settings import CloudSettings
 from ..cloud.stream import open_cloud
 from ..cloud.writers import SUFFIXES, describe_unit, write_colored
 from ..errors import InputError
@@ -21,11 +22,11 @@ from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import turn_positions
 from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
+from ..judge.result import FAILED, Result
 from ..kernels.jit import F0, HALF, kernel
-from ..opened_scan import OpenedScan, read_as_localized
 from ..panorama import Panorama, texels
 from ..panorama.model import shrink
-from ..result import FAILED, Result
+from ..result_photo import read_as_localized
 from ..scan_map.open_map import find_prepared_map
 from ..scan_map.scan_map import SHAPE_ALONE, ScanMap, change_colors
 from .alignment import Anchor, Sight, align, look, weigh_points
@@ -232,25 +233,29 @@ def list_leaves(scan_map: ScanMap) -> Array32:
     return np.ascontiguousarray(scan_map.octree.level(scan_map.octree.leaf_size)[:, :3])
 
 
-def write_colored_scan(scan: OpenedScan, results: Sequence[Result], out: Path) -> Colored:
-    """Write the points of a scan's files in the colours of photos that were localized in it.
+def write_colored_scan(
+    paths: Sequence[Path],
+    scan_map: ScanMap,
+    cloud_settings: CloudSettings,
+    results: Sequence[Result],
+    out: Path,
+    workers: Workers,
+) -> Colored:
+    """Write the points of a scan's files in the colours of photos that were localized in its map.
 
-    Points that no photo sees are black. Raises InputError if the scan is not of files, if fewer than two
+    Points that no photo sees are black. Raises InputError if the scan is a prepared map, if fewer than two
     photos are localized, and for an unknown suffix.
     """
-    scan_map = scan.prepared
-    paths = [Path(name) for name in ([scan.name] if isinstance(scan.name, str) else scan.name)]
-    if not isinstance(scan_map, ScanMap) or find_prepared_map(paths):
+    if find_prepared_map(paths):
         raise InputError(f"{paths[0]}: found no files of points, wanted those of a scan to be coloured")
     check_suffix(out)
-    workers = scan.workers
     brushes = make_aligned_brushes(scan_map, results, workers)
 
     def color(points_world: Array) -> Paint:
         points_map = (points_world - scan_map.origin_world) @ scan_map.R_map_from_world.T
         return paint_points(points_map.astype(np.float32), brushes, Workers(workers.num_threads))
 
-    cloud = open_cloud(paths, scan.cloud_settings, workers.show)
+    cloud = open_cloud(paths, cloud_settings, workers.show)
     leaves_world = list_leaves(scan_map) @ scan_map.R_map_from_world + scan_map.origin_world
     box_world = np.stack([leaves_world.min(axis=0), leaves_world.max(axis=0)])
     counts = write_colored(cloud, color, box_world, out, scan_map.crs)

@@ -25,7 +25,7 @@ from ..jobs.threads import Workers
 from ..judge.candidate import Candidate
 from ..judge.claim import Claim, marginal
 from ..judge.consensus import WRONG_DEVIATION, WRONG_SHARE, Opinion
-from ..judge.localization import FocalLength
+from ..judge.result_parts import FocalLength
 from ..local_features.matching import NO_MATCHES, Matches
 from ..panorama import Panorama
 from ..panorama.model import FocalPrior

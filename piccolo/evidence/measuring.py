@@ -11,7 +11,7 @@ import numpy as np
 from ..jobs.threads import Workers
 from ..judge.candidate import Selection
 from ..judge.case import Geometry, Measured
-from ..judge.localization import Evidence
+from ..judge.result_parts import Evidence
 from ..judge.selection import count_matches
 from ..optimize.sampling_loss import sampling_loss
 from ..problem.problem import Problem

@@ -18,7 +18,7 @@ from ..camera.corrections import Corrections
 from ..geometry.pose import Pose
 from ..jobs.threads import Workers
 from ..judge.claim import Claim
-from ..judge.localization import SphereGeometry
+from ..judge.result_parts import SphereGeometry
 from ..problem.problem import Problem
 from ..problem.stages import Limits
 from .self_calibration import Estimate, Freedom, FreeEnd, descend_freely, invert

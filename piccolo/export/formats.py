@@ -19,9 +19,9 @@ from ..errors import InputError, import_optional, printable
 from ..files.atomic import check_output, check_output_folder, replacing_folder, write_atomically, write_lines
 from ..files.json_file import read_bytes
 from ..geometry.pose import CAMERA_AXES, Pose, heading_pitch_roll_deg, quaternion_wxyz, turn_axes
+from ..judge.result import Result
 from ..panorama.gpano import with_pose
 from ..panorama.picture import WANTED
-from ..result import Result
 from .colmap import write_colmap
 from .faces import write_faces
 from .posed_images import (

@@ -22,7 +22,7 @@ from ..files.atomic import write_atomically, write_lines
 from ..files.json_file import naming, read_json
 from ..geometry.pose import Pose, log_so3
 from ..geometry.pose_gaussian import PoseGaussian, subtract
-from ..result import Result
+from ..judge.result import Result
 from ..together.bundle_adjustment import (
     UNKNOWN_SCALE,
     Bundle,

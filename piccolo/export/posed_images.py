@@ -17,9 +17,9 @@ from ..errors import InputError, unreadable
 from ..files.atomic import is_stream, replacing, write_lines
 from ..geometry.pose import Pose
 from ..judge.probability import LOCALIZED
+from ..judge.result import Result
 from ..panorama import panorama_size
 from ..panorama.gpano import check_size
-from ..result import Result
 
 NO_UTF8 = "[\ud800-\udfff]"  # in a name
 # by the lens of a camera model: its name in a format, and the coefficients that it may have

@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..geometry.colors import unpack_rgb
 from ..geometry.pose import Pose, rotate_points
 from ..jobs.threads import Workers
-from ..result import Result
+from ..judge.result import Result
 from ..scan_map.open_map import find_prepared_map, open_points
 from ..views.zbuffer import VISIBLE_WIDTH, indices_in_front, nearest_depth
 from .posed_images import Options, PosedImage

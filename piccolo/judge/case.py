@@ -7,9 +7,9 @@ from ..camera import Mount
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
 from .candidate import Selection
-from .localization import Evidence, FocalLength, SphereGeometry
 from .probability import Standing
 from .reasons import Contradiction
+from .result_parts import Evidence, FocalLength, SphereGeometry
 
 
 class Errors(NamedTuple):

@@ -8,10 +8,11 @@ from ..scan_map.scan_map import ScanMap
 from .belief import Belief
 from .case import Case, Geometry
 from .consensus import MOST_CONFLICT, Opinion
-from .localization import Alternative, FocalLength, Localization
 from .pose_covariance import describe_errors
 from .probability import LOCALIZED
 from .reasons import Reason, explain
+from .result import Result
+from .result_parts import Alternative, FocalLength
 
 MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
 NOT_AS_CLAIMED = (
@@ -27,7 +28,7 @@ OTHERS = {  # corrections of a lens besides its focal length, in words
 TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported
 
 
-def conclude(scan_map: ScanMap, case: Case, belief: Belief, min_confidence: float) -> Localization:
+def conclude(scan_map: ScanMap, case: Case, belief: Belief, min_confidence: float) -> Result:
     """Return the result in the world for a case and a belief, with what rules the pose out."""
     measured = case.measured
     geometry = case.geometry
@@ -44,8 +45,8 @@ def conclude(scan_map: ScanMap, case: Case, belief: Belief, min_confidence: floa
         Alternative(scan_map.to_world(h.pose), h.score, s.num_matches)
         for h, s in zip(case.found.alternatives, case.standings[1:], strict=True)
     ]
-    described = Localization(
-        pose=scan_map.to_world(measured.pose),
+    described = Result(
+        best_pose=scan_map.to_world(measured.pose),
         loss=measured.loss,
         evidence=measured.evidence,
         alternatives=tuple(alternatives),
@@ -62,7 +63,7 @@ def conclude(scan_map: ScanMap, case: Case, belief: Belief, min_confidence: floa
     return replace(decided, warnings=(*warnings, *doubts))
 
 
-def follow_consensus(found: Localization, consensus: Opinion, min_confidence: float) -> Localization:
+def follow_consensus(found: Result, consensus: Opinion, min_confidence: float) -> Result:
     """Return a photo's result, its given focal length compared with that of all photos of its camera.
 
     The doubt about what was given, and with it the confidence, follow from `consensus`. The doubt of a photo
@@ -79,7 +80,8 @@ def follow_consensus(found: Localization, consensus: Opinion, min_confidence: fl
     told = replace(found, focal_length=focal)
     if consensus.conflict(focal.prior_deviation) > MOST_CONFLICT:
         px = focal.given_px * math.exp(consensus.off)
-        told = replace(told, warnings=(contradict("the pictures of this camera have", focal, px),))
+        warning = contradict("the pictures of this camera have", focal, px)
+        told = replace(told, warnings=(*told.warnings, warning))
         belief = belief.rule_out(Reason.CAMERA)
     return told.take_belief(belief, min_confidence)
 
@@ -89,10 +91,10 @@ def contradict(who_has: str, focal: FocalLength, px: float) -> str:
     return f"{who_has} a focal length of {px:.0f} px, not {focal.given_px:.0f}: check {focal.source}"
 
 
-def take_pose(judged: Localization, fused: PoseGaussian, scan_map: ScanMap) -> Localization:
+def take_pose(judged: Result, fused: PoseGaussian, scan_map: ScanMap) -> Result:
     """Return a result with another pose of the same place."""
     described = describe_errors(fused, scan_map.R_map_from_world.T)
-    return replace(judged, pose=scan_map.to_world(fused.pose), covariance=described, gaussian=fused)
+    return replace(judged, best_pose=scan_map.to_world(fused.pose), covariance=described, gaussian=fused)
 
 
 def explain_doubts(geometry: Geometry, status: str) -> tuple[str, ...]:

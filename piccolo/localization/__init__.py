@@ -1,7 +1,7 @@
 """The default method: it localizes a panorama in a prepared scan.
 
 A photo's way from its file to a result:
-1. `opened_scan.OpenedScan.localize` reads it (`panorama.read_panorama`) and asks for its GPS position;
+1. `scan.Scan.localize_photo` reads it (`panorama.read_panorama`) and asks for its GPS position;
 2. `localize.localize` makes a `Problem` of its images and the part of the map that the prior allows;
 3. `attempts.plan_attempts` lists the searches: a brief one by views, local features, all views;
 4. each finds starts (`search.search_poses`) and refines few of them (`beam`, on the stages of `ladder`) to
@@ -9,5 +9,5 @@ A photo's way from its file to a result:
 5. `last_descent.refine_best` refines the best candidates to the end and chooses (`examine.choose`);
 6. `calibration` compares what the photo says of its geometry, and refines with what it finds;
 7. `judging.judge` gathers the case and a belief; `judge.conclude` names reasons, `judge.belief` decides;
-8. `result.with_localization` makes the result in the world, which a command writes.
+8. `places.add_places` names the scan and the storey; `Result.complete` says of which photo the result is.
 """

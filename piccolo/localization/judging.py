@@ -17,8 +17,8 @@ from ..judge.belief import Belief, make_belief
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Case
 from ..judge.conclude import conclude
-from ..judge.localization import Localization
 from ..judge.probability import posterior
+from ..judge.result import Result, nothing_found
 from ..judge.selection import assess, credit_copies, is_mirrored
 from ..problem.problem import Problem
 from .copies import list_reported
@@ -39,7 +39,7 @@ class Found(NamedTuple):
         return Found(self.problem.forget(), self.selection.forget(), self.fit)
 
 
-def judge(found: Found, means: Means, min_confidence: float, may_promote: bool = True) -> Localization:
+def judge(found: Found, means: Means, min_confidence: float, may_promote: bool = True) -> Result:
     """Return the result for the best pose of a photo by itself.
 
     If `may_promote`, a copy of the best pose's place that turns out likelier becomes the best.
@@ -48,7 +48,7 @@ def judge(found: Found, means: Means, min_confidence: float, may_promote: bool =
     workers = means.workers
     measured = measure(problem, selection, fit, workers)
     if measured is None:
-        return Localization()
+        return nothing_found()
     reported, is_copy = list_reported(problem, selection, means.effort, workers)
     standings = credit_copies(assess(problem.profile, reported), is_copy)
     places = posterior(standings, measured.errors.std_of_fit, problem.method)[:-1]
@@ -84,7 +84,7 @@ def judge_together(
     belief: Belief,
     means: Means,
     min_confidence: float,
-) -> Localization:
+) -> Result:
     """Return the result of a photo whose pose is what it and others say together.
 
     `gaussian` is that pose in the map; the best candidate has the same pose. `belief` is in it and each
@@ -95,7 +95,7 @@ def judge_together(
     selection = complete(problem, selection, means.workers)
     measured = measure(problem, selection, fit, means.workers)
     if measured is None:
-        return Localization()
+        return nothing_found()
     measured = measured._replace(
         pose=gaussian.pose,
         errors=measured.errors._replace(gaussian=gaussian),
@@ -106,9 +106,7 @@ def judge_together(
     return decide_case(problem, case, belief, means, min_confidence)
 
 
-def decide_case(
-    problem: Problem, case: Case, belief: Belief, means: Means, min_confidence: float
-) -> Localization:
+def decide_case(problem: Problem, case: Case, belief: Belief, means: Means, min_confidence: float) -> Result:
     """Return the result of a case; the mirrored photo is searched if any pose is likely."""
     if case.geometry is not None:  # no pose is surer than what it rests on
         belief = replace(belief, doubt=case.geometry.doubt)

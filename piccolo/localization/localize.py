@@ -13,9 +13,10 @@ from ..judge.alternatives import MAX_ALTERNATIVES
 from ..judge.belief import NOTHING, make_belief
 from ..judge.by_others import share_place
 from ..judge.candidate import Candidate, Selection
-from ..judge.localization import Alternative, FocalLength, Localization
 from ..judge.probability import LOCALIZED
 from ..judge.reasons import Reason
+from ..judge.result import Result, nothing_found
+from ..judge.result_parts import Alternative, FocalLength
 from ..judge.selection import is_faint, rank
 from ..panorama import Panorama
 from ..panorama.edges import find_axes
@@ -38,9 +39,7 @@ NO_PIXEL = "the panorama: no pixel counts, all are masked"
 
 
 @one_blas_thread()
-def localize(
-    scan_map: ScanMap, panorama: Panorama, settings: CoarseToFineSettings, means: Means
-) -> Localization:
+def localize(scan_map: ScanMap, panorama: Panorama, settings: CoarseToFineSettings, means: Means) -> Result:
     """Localize a panorama: search until one attempt is sure, refine the best poses, judge the best one."""
     problem = prepare_search(scan_map, panorama, settings, means.watch)
     if problem is None:
@@ -64,13 +63,13 @@ def prepare_search(
         return prepare_problem(panorama, allowed_map, settings.prior, settings.gravity, settings.method)
 
 
-def explain_nothing(scan_map: ScanMap, panorama: Panorama, prior: Prior) -> Localization:
+def explain_nothing(scan_map: ScanMap, panorama: Panorama, prior: Prior) -> Result:
     """Return the result where there is nothing to search, with the reason."""
     if len(apply_prior(scan_map, prior).sparse) > 0:
-        return Localization(warnings=(NO_PIXEL,))
+        return nothing_found(NO_PIXEL)
     is_told = len(scan_map.centers) > 0  # else the scan has no position at all
     belief = NOTHING.rule_out(Reason.NOWHERE) if is_told else NOTHING
-    return Localization(belief=belief, warnings=(nothing_allowed(scan_map, prior),))
+    return nothing_found(nothing_allowed(scan_map, prior), belief=belief)
 
 
 def find(problem: Problem, scan_map: ScanMap, means: Means) -> Found:
@@ -157,11 +156,11 @@ def has_guessed_focal(panorama: Panorama) -> bool:
 
 def localize_guessed(
     scan_map: ScanMap, panorama: Panorama, settings: CoarseToFineSettings, means: Means
-) -> Localization:
+) -> Result:
     """Localize a photo with several focal lengths around a guess, until one result is sure."""
     camera = panorama.cameras[0].camera
     width = panorama.rgb.shape[1]
-    found: list[Localization] = []
+    found: list[Result] = []
     for guess in GUESSES:
         photo = panorama.resample(camera.change(guess), width)
         found.append(localize(scan_map, photo, settings, means))
@@ -170,29 +169,31 @@ def localize_guessed(
     return select_likeliest(found, settings)
 
 
-def is_same_place(one: Localization, pose: Pose, focal: FocalLength | None) -> bool:
+def is_same_place(one: Result, pose: Pose, focal: FocalLength | None) -> bool:
     """Return True if a pose is a result's up to a move along the view that their focal lengths explain."""
-    if one.pose is None:
+    own = one.best_pose
+    if own is None:
         return False
     change = math.log(focal.px / one.focal_length.px) if focal and one.focal_length else 0.0
-    offset = pose.center_world - one.pose.center_world
-    ahead = one.pose.R_cam_from_world[0]
+    offset = pose.center_world - own.center_world
+    ahead = own.R_cam_from_world[0]
     along = float(offset @ ahead)
     moved = Pose(pose.R_cam_from_world, pose.center_world - along * ahead)
-    return abs(along) < CONFIRMED.distance + MOST_RANGE * abs(change) and CONFIRMED.holds(one.pose, moved)
+    return abs(along) < CONFIRMED.distance + MOST_RANGE * abs(change) and CONFIRMED.holds(own, moved)
 
 
-def select_likeliest(found: Sequence[Localization], settings: CoarseToFineSettings) -> Localization:
+def select_likeliest(found: Sequence[Result], settings: CoarseToFineSettings) -> Result:
     """Return the most confident of several results, its confidence reduced by results at other places."""
-    places: list[Localization] = []
+    places: list[Result] = []
     for one in sorted(found, key=lambda f: -f.confidence):
-        if not any(one.pose is None or is_same_place(f, one.pose, one.focal_length) for f in places):
+        pose = one.best_pose
+        if not any(pose is None or is_same_place(f, pose, one.focal_length) for f in places):
             places.append(one)
     best, *elsewhere = places
     others = [
-        (Alternative(f.pose, f.evidence.score, f.evidence.num_matches), f.confidence)
+        (Alternative(f.best_pose, f.evidence.score, f.evidence.num_matches), f.confidence)
         for f in elsewhere
-        if f.pose and f.evidence
+        if f.best_pose and f.evidence
     ]
     if not any(confidence for _, confidence in others):
         return best

@@ -2,13 +2,13 @@
 
 from dataclasses import replace
 
-from ..judge.localization import Localization
+from ..judge.result import Result
 from ..scan_map.scan_map import ScanMap, scan_of
 
 
-def add_places(scan_map: ScanMap, found: Localization) -> Localization:
+def add_places(scan_map: ScanMap, found: Result) -> Result:
     """Return a result with the scans, the storey (from 1, the lowest) and the height above the floor."""
-    pose = found.pose
+    pose = found.best_pose
     if pose is None:
         return found
     (storey,), (height,) = scan_map.storeys.at(scan_map.from_world(pose).center_world[None])

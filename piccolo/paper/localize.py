@@ -18,8 +18,9 @@ from ..geometry.sphere import solid_angles
 from ..jobs.threads import Stopwatch, Workers
 from ..judge.alternatives import Hypothesis, alternative_poses, best_distinct
 from ..judge.belief import Belief, make_belief
-from ..judge.localization import Alternative, Evidence, Localization
 from ..judge.probability import LEAST_LOGIT_SCORE
+from ..judge.result import Result, nothing_found
+from ..judge.result_parts import Alternative, Evidence
 from ..optimize.refine import DescentSettings, Loss, Refined, make_sampling_loss, refine
 from ..panorama import Panorama
 from ..panorama.model import shrink
@@ -201,7 +202,7 @@ def search(
 
 def localize(
     paper_map: PaperMap, panorama: Panorama, settings: PaperSettings, workers: Workers, watch: Stopwatch
-) -> Localization:
+) -> Result:
     """Localize by Algorithm 1 of the paper: search, refine, select; then evaluate the selected pose."""
     points = paper_map.points
     loss = settings.make_loss(panorama)
@@ -211,11 +212,11 @@ def localize(
         refined = list(workers.map(lambda s: refine(points, loss, s.pose, settings), starts, "refine"))
         best = min(refined, key=lambda r: r.loss, default=None)
     if best is None or not np.isfinite(best.loss):
-        return Localization()
+        return nothing_found()
     with watch.stage("refine"):
         evidence, others = evaluate(points, panorama, best, refined)
-    found = Localization(
-        pose=paper_map.to_world(best.pose),
+    found = Result(
+        best_pose=paper_map.to_world(best.pose),
         loss=best.loss,
         evidence=evidence,
         alternatives=tuple(Alternative(paper_map.to_world(h.pose), h.score) for h in others),

@@ -17,8 +17,9 @@ from ..files.atomic import temporary_folder, write_atomically
 from ..files.cache import digest_of_sources
 from ..geometry.pose import Pose
 from ..jobs.threads import Workers
+from ..judge.result import FAILED, UNREADABLE, Result
 from ..photo import File
-from ..result import FAILED, UNREADABLE, Result, check_scan
+from ..result_files import check_scan
 from ..scan import Scan
 from ..scan_map.scan_map import ScanMap
 from ..views.pictures import encode_image
@@ -296,9 +297,8 @@ def write_report(
     check_kind("scan", scan, Scan)
     check_kind("out", out, File)
     check_kind("settings", settings, ReportSettings)
-    opened = scan._opened
-    if not isinstance(opened.prepared, ScanMap):
+    if not isinstance(scan.prepared, ScanMap):
         raise InputError("write_report: found a scan of the preset paper, wanted one of the default method")
     several = [results] if isinstance(results, str | PathLike) else results
     entries = site.collect_entries([item if isinstance(item, Result) else Path(item) for item in several])
-    return build_report(entries, opened.prepared, Path(out), settings, opened.workers).page
+    return build_report(entries, scan.prepared, Path(out), settings, scan.workers).page

@@ -7,9 +7,9 @@ from functools import cached_property
 from pathlib import Path
 
 from ..errors import InputError
-from ..opened_scan import photo_of
+from ..judge.result import Result
 from ..panorama.photo import sha256_of
-from ..result import Result
+from ..result_photo import photo_of
 from .pictures import FRAME
 
 

@@ -26,8 +26,9 @@ from ..geometry.pose_gaussian import turn_positions
 from ..judge.pose_covariance import PoseCovariance
 from ..judge.probability import NOT_LOCALIZED
 from ..judge.reasons import Reason
+from ..judge.result import FAILED, UNREADABLE, Result
 from ..judge.sure import SHOWN
-from ..result import FAILED, UNREADABLE, Result, read_results
+from ..result_files import read_results
 from ..scan_map.scan_map import ScanMap
 
 INDEX = "index.html"
@@ -121,7 +122,7 @@ def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> d
 
 def list_contradicted(result: Result) -> list[Reason]:
     """List what was told of a photo that rules its poses out."""
-    return sorted(result.belief.ruled_out - NOT_TOLD) if result.belief else []
+    return sorted(result.belief.ruled_out - NOT_TOLD)
 
 
 def document_of_found(result: Result, best_pose: Pose, scan_map: ScanMap) -> dict[str, Any]:

@@ -24,10 +24,10 @@ from .. import __version__
 from ..batch.localizer import Task
 from ..errors import InputError
 from ..jobs.processes import OpeningError, Processes, TooSlowError, WorkerLostError
+from ..judge.result import FAILED, UNREADABLE, Result
 from ..photo import Photo
 from ..problem.settings import CoarseToFineSettings
 from ..report import site
-from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.scan_map import ScanMap
 from .access import Access
 from .asking import FORM, apply_options, make_photo, parse_options, read_form

@@ -17,12 +17,12 @@ from ..errors import InputError
 from ..files.atomic import temporary_folder
 from ..jobs.processes import Function, Processes
 from ..jobs.threads import Workers
-from ..opened_scan import OpenedScan
+from ..judge.result import Result
 from ..panorama.picture import open_picture
 from ..report import site
 from ..report.build import WIDTH, document_of_scan, list_poses
 from ..report.pictures import make_pictures
-from ..result import Result
+from ..scan import Scan
 from ..scan_map.open_map import write_map
 from ..scan_map.scan_map import ScanMap
 from ..views.surfels import MAX_SURFELS, make_surfels
@@ -167,7 +167,7 @@ def content_of(task: Task) -> bytes:
     return (task.files or {})[task.photo.name]
 
 
-def draw(scan: OpenedScan, surfels: Any, drawing: Drawing) -> str:
+def draw(scan: Scan, surfels: Any, drawing: Drawing) -> str:
     """Return JSON of a photo's thumbnail and pictures."""
     result = drawing.result
     poses = list_poses(result, scan.prepared.from_world)

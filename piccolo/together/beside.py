@@ -20,8 +20,8 @@ from ..geometry.pose_gaussian import PoseGaussian, probability_within, turn_posi
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.by_others import believe_beside
 from ..judge.conclude import take_pose
-from ..judge.localization import Localization
 from ..judge.pose_covariance import PoseCovariance
+from ..judge.result import Result, nothing_found
 from ..local_features.hypotheses import exact_pose, propose_poses
 from ..local_features.matching import Matches
 from ..localization.attempts import add_verified
@@ -82,7 +82,7 @@ def localize_beside(
     settings: CoarseToFineSettings,
     workers: Workers,
     watch: Stopwatch,
-) -> tuple[Localization, tuple[str, ...]]:
+) -> tuple[Result, tuple[str, ...]]:
     """Localize a photo of a part of the sphere by others that are sure, given by their names.
 
     `known` are poses in the map that were found for it alone. Returns the result and the names of those that
@@ -96,7 +96,7 @@ def localize_beside(
         matched = filter(None, workers.map(partial(match_picture, problem, workers), asked, "match"))
         found = [other for other, _ in sorted(matched, key=lambda pair: -pair[1])[:MOST_BESIDE]]
     if not found:
-        return Localization(), ()
+        return nothing_found(), ()
     means = Means(settings.effort, workers, watch)
     with watch.stage("refine"):
         problem = replace(problem, beside=tuple(other.matches for other in found))
@@ -108,7 +108,7 @@ def localize_beside(
         judged = judge(ended, means, settings.min_confidence)
         kept = list_agreeing(ended.problem.method, judged, found, ended.problem.beside, scan_map)
         if not kept:
-            return Localization(), ()
+            return nothing_found(), ()
         within = None
         fused = fuse(judged, kept[0], ended)
         if fused is not None:
@@ -120,15 +120,15 @@ def localize_beside(
 
 def list_agreeing(
     method: Method,
-    judged: Localization,
+    judged: Result,
     found: Sequence[Neighbor],
     matches: Sequence[Matches],
     scan_map: ScanMap,
 ) -> list[Neighbor]:
     """List the photos whose matches (rays by the final camera) put a photo where it is by all evidence."""
-    if judged.pose is None:
+    if judged.best_pose is None:
         return []
-    own = scan_map.from_world(judged.pose)
+    own = scan_map.from_world(judged.best_pose)
     agreeing = []
     for other, turned in zip(found, matches, strict=True):
         exact = exact_pose(turned, own)
@@ -137,7 +137,7 @@ def list_agreeing(
     return agreeing
 
 
-def fuse(judged: Localization, other: Neighbor, ended: Found) -> PoseGaussian | None:
+def fuse(judged: Result, other: Neighbor, ended: Found) -> PoseGaussian | None:
     """Return the mean of a result's own pose and of that by the photo beside, in the map.
 
     Errors of the focal length and of the scan are common to both. None for a result that is ruled out, and if

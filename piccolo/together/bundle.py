@@ -23,8 +23,8 @@ from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.by_others import Shares, believe_together
 from ..judge.candidate import Selection
 from ..judge.consensus import MOST_CONFLICT, Consensus
-from ..judge.localization import Localization
 from ..judge.probability import LOCALIZED
+from ..judge.result import Result, nothing_found
 from ..localization.calibration import calibrate
 from ..localization.judging import Found, judge, judge_together
 from ..localization.localize import explain_nothing, find, find_by_edges, prepare_search
@@ -82,7 +82,7 @@ def localize_bundle(
     workers: Workers,
     watch: Stopwatch,
     errors: RelativeErrors,
-) -> list[Localization]:
+) -> list[Result]:
     """Localize photos together; `cams_from_bundle` are their poses in any common frame.
 
     `errors` are those expected of these poses; their scale is unknown if its deviation is large.
@@ -91,7 +91,7 @@ def localize_bundle(
     members: dict[int, Member] = {}
     means = Means(settings.effort, workers, watch)
 
-    def localize_alone(k: int, panorama: Panorama) -> Localization:
+    def localize_alone(k: int, panorama: Panorama) -> Result:
         problem = prepare_search(scan_map, panorama, settings, watch)
         if problem is None:
             return explain_nothing(scan_map, panorama, settings.prior)
@@ -111,7 +111,7 @@ def localize_bundle(
     return [together.get(k, one) for k, one in enumerate(alone)]
 
 
-def expect_focal(panoramas: Sequence[Panorama], alone: Sequence[Localization]) -> dict[int, Panorama]:
+def expect_focal(panoramas: Sequence[Panorama], alone: Sequence[Result]) -> dict[int, Panorama]:
     """Return the photos that are not sure, by number, with the focal length that those that are sure tell.
 
     The photos are of one camera: what was given and what these say are averaged.
@@ -132,7 +132,7 @@ def expect_focal(panoramas: Sequence[Panorama], alone: Sequence[Localization]) -
 
 def judge_members(
     members: dict[int, Member], errors: RelativeErrors, means: Means, min_confidence: float
-) -> dict[int, Localization]:
+) -> dict[int, Result]:
     """Return the results of photos together, or each by itself with the reason."""
     workers = means.workers
     bundles = propose_bundles(list(members.values()), errors)
@@ -243,16 +243,16 @@ def describe_scale(log_scale: float) -> str:
     return f"{percent:.0f} % too {'short' if log_scale > 0.0 else 'long'}"
 
 
-def judge_apart(member: Member, reason: str) -> Localization:
+def judge_apart(member: Member, reason: str) -> Result:
     """Return a photo's own result, with the reason."""
     return replace(member.alone, warnings=(*member.alone.warnings, reason))
 
 
-def refuse(member: Member, reason: str) -> Localization:
+def refuse(member: Member, reason: str) -> Result:
     """Return a photo's own result if it is sure, else none, with the reason."""
     if member.alone.status == LOCALIZED:
         return judge_apart(member, reason)
-    return Localization(warnings=(*member.alone.warnings, reason))
+    return nothing_found(*member.alone.warnings, reason)
 
 
 class Placed(NamedTuple):
@@ -290,7 +290,7 @@ def judge_member(
     elsewhere: Sequence[Bundle],
     probabilities: Array,
     means: Means,
-) -> Localization:
+) -> Result:
     """Return the result of a photo in a bundle that is believed.
 
     `elsewhere` are the other poses of the bundle; `probabilities` (K + 1,) are of all of them, and of none.

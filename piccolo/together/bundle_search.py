@@ -20,8 +20,8 @@ from ..judge.by_others import LEAST_NONE
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Errors
 from ..judge.consensus import MOST_CONFLICT
-from ..judge.localization import Localization
 from ..judge.probability import CONTRADICTED_ODDS, posterior
+from ..judge.result import Result
 from ..judge.selection import assess
 from ..localization.judging import Found
 from ..localization.ladder import refine
@@ -45,7 +45,7 @@ class Member:
     """A photo of the bundle, found by itself."""
 
     found: Found  # without what takes memory
-    alone: Localization
+    alone: Result
     cam_from_bundle: Pose
 
     @property
@@ -59,7 +59,7 @@ class Member:
     @property
     def own_poses(self) -> list[tuple[Candidate, float]]:
         """Poses in the map with the probabilities of their places, best first; none if ruled out."""
-        if self.alone.pose is None or self.alone.belief.ruled_out:
+        if self.alone.best_pose is None or self.alone.belief.ruled_out:
             return []
         places = self.alone.belief.sound_places[:-1].tolist()
         return list(zip(self.found.selection.candidates, places, strict=False))

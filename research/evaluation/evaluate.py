@@ -31,8 +31,10 @@ from piccolo.files.line_file import open_locked
 from piccolo.jobs.cluster import Cluster
 from piccolo.jobs.memory import limit_memory
 from piccolo.jobs.threads import Workers
-from piccolo.opened_scan import OpenedScan, settings_json
-from piccolo.result import UNREADABLE, check_scan, describe_failure, read_results
+from piccolo.judge.result import UNREADABLE
+from piccolo.photo_reader import describe_failure, settings_json
+from piccolo.result_files import check_scan, read_results
+from piccolo.scan import Scan
 from piccolo.scan_map.open_map import scan_sha256_of
 
 from ..scene import Query, Scene, find_scenes, input_files
@@ -225,7 +227,7 @@ def localize_queries(
     show = arguments.progress()
     are_inside: list[bool] = []  # the cloud's box
 
-    def open_scan(localizer: Localizer, num_threads: int) -> OpenedScan:
+    def open_scan(localizer: Localizer, num_threads: int) -> Scan:
         scan = localizer.open_scan(Workers(num_threads, show))
         are_inside.extend(query_result.is_in_box(scan, query.pose) for query in queries)
         return scan

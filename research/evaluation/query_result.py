@@ -17,8 +17,8 @@ from piccolo.files.json_file import document_of, parse_lines, read_bytes
 from piccolo.files.line_file import whole_size
 from piccolo.geometry.pose import MAX_ANGLE, MAX_DISTANCE, Pose, pose_errors
 from piccolo.judge.probability import LOCALIZED
-from piccolo.opened_scan import OpenedScan
-from piccolo.result import Result
+from piccolo.judge.result import Result
+from piccolo.scan import Scan
 
 from ..scene import Query, Scene, document_of_pose, pose_of
 
@@ -124,7 +124,7 @@ def make_query_result(scene: Scene, query: Query, result: Result, is_in_box: boo
     return QueryResult(scene.name, scene.name_of(query), query.variant, is_in_box, true_pose, result)
 
 
-def is_in_box(scan: OpenedScan, pose: Pose) -> bool:
+def is_in_box(scan: Scan, pose: Pose) -> bool:
     """Return True if a pose lies in the bounding box of the scan's points (the paper's protocol)."""
     points = scan.prepared.points
     center: Array = scan.prepared.from_world(pose).center_world

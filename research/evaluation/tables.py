@@ -12,7 +12,7 @@ import numpy as np
 from piccolo.arrays import Array
 from piccolo.errors import import_optional, printable
 from piccolo.export.formats import cell
-from piccolo.result import Result
+from piccolo.judge.result import Result
 
 from ..scene import Query, Scene
 from .query_result import PAPER_THRESHOLDS, QueryResult, Thresholds, make_query_result

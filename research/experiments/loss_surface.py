@@ -29,7 +29,7 @@ from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import read_panorama
 from piccolo.panorama.model import shrink
 from piccolo.panorama.texels import Texels, pack_texels
-from piccolo.result import read_results
+from piccolo.result_files import read_results
 from piccolo.scan_map.open_map import open_points
 from piccolo.views.zbuffer import is_free_space, visible_points
 

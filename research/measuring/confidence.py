@@ -15,7 +15,7 @@ from piccolo.cloud.stream import open_cloud, stream_of_arrays
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Stopwatch, Workers, num_cores
-from piccolo.judge.localization import Localization
+from piccolo.judge.result import Result
 from piccolo.localization.localize import localize
 from piccolo.localization.means import Means
 from piccolo.panorama import read_panorama
@@ -218,18 +218,16 @@ def all_trials(arguments: Arguments, workers: Workers) -> Iterator[tuple[str, Po
             yield scene.name, points, trials
 
 
-def localize_trial(
-    scan_map: ScanMap, trial: Trial, workers: Workers, method: Method = METHOD
-) -> Localization:
+def localize_trial(scan_map: ScanMap, trial: Trial, workers: Workers, method: Method = METHOD) -> Result:
     """Localize the photo of a trial."""
     settings = CoarseToFineSettings(gravity=trial.gravity, method=method)
     photo = Photo(trial.rgb, focal_px=trial.focal_px, camera=trial.calibration, mask=trial.is_masked)
     return localize(scan_map, read_panorama(photo), settings, Means(settings.effort, workers, Stopwatch()))
 
 
-def trial_line(scene: str, trial: Trial, found: Localization) -> dict[str, object]:
+def trial_line(scene: str, trial: Trial, found: Result) -> dict[str, object]:
     """Return what tools/benchmark.py calibration reads of a trial."""
-    poses = [found.pose, *(a.pose for a in found.alternatives)] if found.pose else []
+    poses = [found.best_pose, *(a.pose for a in found.alternatives)] if found.best_pose else []
     others = (alternative.probability for alternative in found.alternatives)
     probabilities = [found.confidence, *others, found.probability_none]
     return {
@@ -269,7 +267,7 @@ def run(arguments: Arguments) -> int:
             for trial in trials:
                 found = localize_trial(scan_map, trial, workers)
                 truth = trial.true_pose
-                ok = bool(truth and found.pose and RIGHT.holds(found.pose, truth))
+                ok = bool(truth and found.best_pose and RIGHT.holds(found.best_pose, truth))
                 rows.append((trial.case, found.status, ok))
                 file.write(json.dumps(trial_line(scene, trial, found)) + "\n")
                 file.flush()

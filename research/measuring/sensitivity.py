@@ -13,8 +13,8 @@ from piccolo.cli.command import Arguments, option
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.geometry.nearness import RIGHT
 from piccolo.jobs.threads import Workers, num_cores
-from piccolo.judge.localization import Localization
 from piccolo.judge.probability import LOCALIZED
+from piccolo.judge.result import Result
 from piccolo.problem.method import METHOD, Method
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
 
@@ -46,7 +46,7 @@ class Place(NamedTuple):
 class Measured(NamedTuple):
     """Results of all trials, in order."""
 
-    found: list[Localization]
+    found: list[Result]
     errors_m: list[float]  # nan where there is no truth or the pose is wrong
 
 
@@ -83,8 +83,8 @@ def measure(places: Sequence[Place], workers: Workers, method: Method = METHOD) 
             found = localize_trial(scan_map, trial, workers, method)
             measured.found.append(found)
             truth = trial.true_pose
-            if truth and found.pose and RIGHT.holds(found.pose, truth):
-                measured.errors_m.append(found.pose.distance(truth))
+            if truth and found.best_pose and RIGHT.holds(found.best_pose, truth):
+                measured.errors_m.append(found.best_pose.distance(truth))
             else:
                 measured.errors_m.append(math.nan)
     return measured
@@ -93,7 +93,7 @@ def measure(places: Sequence[Place], workers: Workers, method: Method = METHOD) 
 def row_of(name: str, measured: Measured, before: Measured) -> dict[str, str]:
     """Return a table's line: what a number's move does, beside the results before."""
     in_both = ~np.isnan(measured.errors_m) & ~np.isnan(before.errors_m)
-    keys = [[(one.status, one.confidence, one.pose) for one in run.found] for run in (measured, before)]
+    keys = [[(one.status, one.confidence, one.best_pose) for one in run.found] for run in (measured, before)]
     num_changed = sum(one != other for one, other in zip(*keys, strict=True))
     is_right = ~np.isnan(measured.errors_m)
     is_sure = np.array([one.status == LOCALIZED for one in measured.found])

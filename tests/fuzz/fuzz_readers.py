@@ -18,10 +18,10 @@ from piccolo.camera.calibration import read_cameras, read_rig
 from piccolo.cloud.settings import BY_FILE
 from piccolo.cloud.stream import FORMATS
 from piccolo.errors import InputError
+from piccolo.judge.result import Result
 from piccolo.panorama import read_panorama
 from piccolo.panorama.photo import read_photo_facts
 from piccolo.photo import Prior
-from piccolo.result import Result
 from piccolo.scan_map.map_file import load_map
 from research.scene import read_scene
 

@@ -20,8 +20,8 @@ from ...geometry.nearness import ONE_ANSWER
 from ...geometry.pose import Pose
 from ...geometry.pose_gaussian import PoseGaussian
 from ...judge.candidate import Candidate
-from ...judge.localization import Localization
 from ...judge.probability import LOCALIZED
+from ...judge.result import Result
 from ...scan_map.camera_positions import COARSE_SPACING
 from ...scan_map.scan_map import ScanMap
 
@@ -57,7 +57,7 @@ class Frame:
     time: float  # [s] from any beginning
     states: list[State] = field(default_factory=list)
     how: How = "none"
-    alone: Localization | None = None  # if it was searched without regard to the others
+    alone: Result | None = None  # if it was searched without regard to the others
     is_key: bool = False
     key: int | None = None  # number of the key frame from which it was tracked, perhaps by way of others
     arrived: Pose | None = None  # pose that tracking gave, supposing that the key frame is at its `departed`
@@ -80,11 +80,11 @@ class Frame:
         return self.alone is not None and self.alone.status == LOCALIZED
 
 
-def list_states(scan_map: ScanMap, found: Localization) -> list[State]:
+def list_states(scan_map: ScanMap, found: Result) -> list[State]:
     """List a frame's poses by its own localization; alternatives, whose covariance is unknown, are rough."""
-    if found.pose is None or found.evidence is None:
+    if found.best_pose is None or found.evidence is None:
         return []
-    poses = [found.pose, *(alternative.pose for alternative in found.alternatives)]
+    poses = [found.best_pose, *(alternative.pose for alternative in found.alternatives)]
     *places, none = found.belief.sound_places.tolist()
     odds = [log_ratio(place, none) for place in places]
     best, *others = [State(scan_map.from_world(pose), o) for pose, o in zip(poses, odds, strict=True)]

@@ -11,7 +11,6 @@ only beyond the differences between exact copies of a room. What a frame may be 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -20,6 +19,7 @@ import numpy as np
 from ...arrays import Array, Mask
 from ...geometry.nearness import ONE_ANSWER
 from ...geometry.pose import Pose, carry
+from ...judge.result_parts import Gap
 from ...scan_map.camera_positions import FreeSpace
 from .frames import JUMP_LOG, MOST_EXPECTED, MOST_ODDS, REACH_SLACK, Frame, Motion, State, state_centers
 
@@ -27,14 +27,6 @@ EVEN = 0.5  # less is not sure
 COPY_LOG_ODDS = 3.0  # copies of a place differ by less (2.1 in 50 probes), if one of them was scanned better
 NEGLIGIBLE = -2.0 * JUMP_LOG  # [log] a way that leaves out more evidence is worse than two jumps
 DRIFT = 0.05  # of the path that an odometry measures, that it may be off
-
-
-@dataclass(frozen=True)
-class Gap:
-    """A part of a walk that nobody can have walked: a lift, a cut, a camera in a pocket."""
-
-    distance: float  # [m]
-    seconds: float
 
 
 class Path(NamedTuple):

@@ -6,7 +6,7 @@ accelerations.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import islice, pairwise
 from typing import Any
@@ -23,14 +23,15 @@ from ...judge.alternatives import MAX_ALTERNATIVES
 from ...judge.belief import make_belief
 from ...judge.conclude import take_pose
 from ...judge.consensus import MOST_CONFLICT
-from ...judge.localization import Alternative, Localization
 from ...judge.pose_covariance import describe_errors
 from ...judge.probability import LOCALIZED
 from ...judge.reasons import explain
+from ...judge.result import Result, nothing_found
+from ...judge.result_parts import Alone, Alternative, Gap, WalkFrame
 from ...problem.problem import Problem
 from .expectation import Expected, Followed
 from .frames import Frame
-from .path import EVEN, Gap, Path, Ranked, believe, build_lattice
+from .path import EVEN, Path, Ranked, believe, build_lattice
 from .tracker import Tracker, find_near, refine_state
 
 LEAST_WALKED = 2.0  # [m] between frames by which an odometry is checked
@@ -39,29 +40,7 @@ TOLD_SCALE = 0.03  # error of an odometry's scale that is reported
 Find = Callable[[Problem], Followed | None]
 
 
-@dataclass(frozen=True)
-class Alone:
-    """The result of a frame localized alone."""
-
-    status: str
-    confidence: float
-    pose: Pose | None  # in the world
-
-
-@dataclass(frozen=True)
-class WalkFrame:
-    """A frame's place in a walk."""
-
-    time: float  # [s] from the walk's beginning; of frames without times their number
-    frame: int  # from 0
-    how: str  # where its pose comes from: "alone", "tracked", "near", or "none"
-    alone: Alone | None  # if it was searched without regard to the others
-    gap: Gap | None  # before it; None without times
-
-
-def make_localizations(
-    tracker: Tracker, show: Progress = no_progress
-) -> list[tuple[Localization, WalkFrame]]:
+def make_localizations(tracker: Tracker, show: Progress = no_progress) -> list[tuple[Result, WalkFrame]]:
     """Return the result of each frame of a walk, given all frames; poses are smoothed together."""
     path, beliefs = finish(tracker, show)
     frames = tracker.frames
@@ -82,12 +61,12 @@ def make_localizations(
     return [(f, describe_frame(frames, k, path.gaps[k])) for k, f in enumerate(found)]
 
 
-def check_odometry(frames: Sequence[Frame], found: Sequence[Localization]) -> tuple[str, ...]:
+def check_odometry(frames: Sequence[Frame], found: Sequence[Result]) -> tuple[str, ...]:
     """Return a warning if the sure frames say that the odometry is too long or too short.
 
     Of the logarithms of ratios of distances the median counts, and their median deviation from it.
     """
-    pairs = [(f.odometry, r.pose) for f, r in zip(frames, found, strict=True) if r.status == LOCALIZED]
+    pairs = [(f.odometry, r.best_pose) for f, r in zip(frames, found, strict=True) if r.status == LOCALIZED]
     sure = [(odometry, pose) for odometry, pose in pairs if odometry and pose]
     ratios = []
     begin = 0
@@ -110,23 +89,23 @@ def describe_frame(frames: Sequence[Frame], k: int, gap: Gap | None) -> WalkFram
     """Return a frame's place in the walk, after a gap if there is one."""
     frame = frames[k]
     own = frame.alone
-    alone = Alone(own.status, own.confidence, own.pose) if own else None
+    alone = Alone(own.status, own.confidence, own.best_pose) if own else None
     return WalkFrame(frame.time, k, frame.how, alone, gap)
 
 
-def make_localization(tracker: Tracker, frame: Frame, ranked: Ranked) -> Localization:
+def make_localization(tracker: Tracker, frame: Frame, ranked: Ranked) -> Result:
     """Make a frame's result from its poses and the probabilities that the walk gives them."""
     if not ranked.states:
-        return frame.alone or Localization()
+        return frame.alone or nothing_found()
     best, *others = ranked.states
     others = others[:MAX_ALTERNATIVES]
     scan_map = tracker.scan_map
     is_own = frame.alone and frame.states and best is frame.states[0]
-    own = frame.alone if is_own and frame.alone else Localization()
+    own = frame.alone if is_own and frame.alone else nothing_found()
     contradicted = contradictions(scan_map, best.pose, tracker.settings.prior)
     belief = make_belief(ranked.probabilities[: 1 + len(others)], probability_within(best.gaussian))
-    described = Localization(
-        pose=scan_map.to_world(best.pose),
+    described = Result(
+        best_pose=scan_map.to_world(best.pose),
         loss=own.loss,
         evidence=own.evidence,
         alternatives=tuple(Alternative(scan_map.to_world(s.pose), s.score or 0.0) for s in others),

@@ -1,61 +1,38 @@
-"""The result of one localization, and its JSON."""
+"""The result of a photo, and its JSON."""
 
 import json
-import math
-import re
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from html import escape
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from . import __version__
-from .arrays import Array
-from .camera import Mount
-from .camera.calibration import document_of as camera_document, read_mounts
-from .errors import UNPRINTABLE, InputError, printable, text_of
-from .files.json_file import document_of, parse_lines, read_bytes
-from .geometry.pose import Pose, check_pose, heading_pitch_roll_deg
-from .geometry.sphere import CONVENTION
-from .jobs.memory import is_shortage
-from .judge.belief import NOTHING, Belief
-from .judge.localization import Alternative, Evidence, FocalLength, Localization, SphereGeometry
-from .judge.pose_covariance import PoseCovariance
-from .judge.probability import AMBIGUOUS, LOCALIZED
-from .photo import GpsPrior
-from .together.walk.results import WalkFrame
+from ..arrays import Array
+from ..camera import Mount
+from ..camera.calibration import document_of as camera_document, read_mounts
+from ..errors import printable
+from ..files.json_file import document_of
+from ..geometry.pose import Pose, check_pose, heading_pitch_roll_deg
+from ..geometry.pose_gaussian import PoseGaussian
+from ..geometry.sphere import CONVENTION
+from ..photo import GpsPrior
+from .belief import NOTHING, Belief, decide
+from .pose_covariance import PoseCovariance
+from .probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED, Standing
+from .result_parts import Alternative, Beside, Evidence, FocalLength, Source, SphereGeometry, WalkFrame
 
 FORMAT = "piccolo-pose/12"
 POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")
 UNREADABLE = "unreadable"
 FAILED = "failed"
 MAX_ROTATION_ERROR = 1e-6  # of R R^T from the identity, in a file
-NO_NAME = re.compile("[\ud800-\udc7f\udd00-\udfff]")  # what os.fsdecode never gives
-WANTED = "wanted JSON lines of localize.py"
 COVARIANCE_CONVENTION = (
     "of (w, d), rotation [rad] about the camera's axes, then translation [m] along the world's: "
     "R_true = exp([w]x) R_cam_from_world, center_true = center_world + d"
 )
 
 
-@dataclass(frozen=True)
-class Source:
-    """Which scan and which photo a result is of; None where that is not known."""
-
-    cloud_sha256: str | None = None  # of the scan's file; of several, of their sorted digests, one a line
-    pano_sha256: str | None = None  # of the photo's file; of cube faces, of their digests in order
-    image_size: tuple[int, int] | None = None  # width and height of the picture as it is stored [px]
-    capture_time: str | None = None  # by EXIF, ISO 8601, with the offset from UTC if EXIF has it
-
-
-@dataclass(frozen=True)
-class Beside:
-    """A second look at a photo, beside others of a batch."""
-
-    photos: tuple[str, ...]  # paths of those that show the same, those with the most matches first
-    asked_sha256: str  # digest of all that were asked
+NO_SOURCE = Source()
 
 
 @dataclass(frozen=True)
@@ -77,7 +54,7 @@ class Result:
     probability_none
         Probability that neither `best_pose` nor an alternative is right; None if the photo was not read.
     belief
-        `Belief`, of which the probabilities are products; None if the photo was not read.
+        `Belief`, of which the probabilities are products; of nothing if the photo was not read.
     alternatives
         Other poses that explain the photo, best first, at most 5.
     evidence
@@ -113,10 +90,10 @@ class Result:
         The reason why a photo is "unreadable" or has "failed".
     """
 
-    status: str
-    confidence: float
-    cloud: str | tuple[str, ...]
-    pano: str
+    status: str = NOT_LOCALIZED
+    confidence: float = 0.0
+    cloud: str | tuple[str, ...] = ""
+    pano: str = ""
     best_pose: Pose | None = None
     loss: float | None = None
     evidence: Evidence | None = None
@@ -125,7 +102,7 @@ class Result:
     seconds: dict[str, float] = field(default_factory=dict, hash=False)
     settings: dict[str, Any] = field(default_factory=dict, hash=False)
     warnings: tuple[str, ...] = ()
-    source: Source = Source()
+    source: Source = NO_SOURCE
     error: str | None = None
     gps_prior: GpsPrior | None = None
     cameras: tuple[Mount, ...] = ()
@@ -137,7 +114,13 @@ class Result:
     height_above_floor: float | None = None
     walk: WalkFrame | None = None
     beside: Beside | None = None
-    belief: Belief | None = None
+    belief: Belief = NOTHING
+    # what the method hands on until the result is complete; no file has it, no user sees it
+    gaussian: PoseGaussian | None = field(default=None, compare=False, repr=False)  # of the pose, in the map
+    # [m] largest deviation if focal length and stitching were exact
+    std_of_fit: float | None = field(default=None, compare=False, repr=False)
+    # evidence for the pose and each alternative
+    standings: tuple[Standing, ...] = field(default=(), compare=False, repr=False)
 
     def __post_init__(self) -> None:
         """Make the arrays read-only, on which the JSON and the hash rest."""
@@ -150,6 +133,11 @@ class Result:
         alone = self.walk.alone.pose if self.walk and self.walk.alone else None
         found = [self.best_pose, *(a.pose for a in self.alternatives), alone]
         return [pose for pose in found if pose is not None]
+
+    @property
+    def is_believed(self) -> bool:
+        """Return True if anything is believed of the photo, be it that no pose was found."""
+        return self.probability_none is not None or self.belief != NOTHING
 
     @property
     def is_calibrated(self) -> bool:
@@ -177,6 +165,37 @@ class Result:
     def cloud_name(self) -> str:
         """Path of the scan, or paths of its files, separated by commas."""
         return self.cloud if isinstance(self.cloud, str) else ", ".join(self.cloud)
+
+    def take_belief(self, belief: Belief, min_confidence: float) -> "Result":
+        """Return this with what is believed of its pose and its alternatives, and the status that follows."""
+        status, probabilities = decide(belief, min_confidence)
+        *of_poses, none = probabilities.tolist()
+        pairs = zip(self.alternatives, of_poses[1:], strict=True)
+        return replace(
+            self,
+            status=status,
+            confidence=of_poses[0] if of_poses else 0.0,
+            probability_none=none,
+            alternatives=tuple(replace(alternative, probability=p) for alternative, p in pairs),
+            belief=belief,
+        )
+
+    def complete(self, blank: "Result") -> "Result":
+        """Return this as the result of a photo of which a blank result says what it is about."""
+        return replace(
+            self,
+            cloud=blank.cloud,
+            pano=blank.pano,
+            seconds=blank.seconds,
+            settings=blank.settings,
+            warnings=blank.warnings + self.warnings,
+            source=blank.source,
+            cameras=self.cameras or blank.cameras,
+            walk=blank.walk,
+            gaussian=None,
+            std_of_fit=None,
+            standings=(),
+        )
 
     def summary(self) -> str:
         """Return the result as a few lines of text."""
@@ -222,13 +241,15 @@ class Result:
 
     def to_json(self) -> str:
         """Return the result as JSON on one line (docs/RESULT.md). NaN and infinity raise ValueError."""
+        from .. import __version__  # noqa: PLC0415  above this, the stub would be read before all others
+
         document = {
             "format": FORMAT,
             "status": self.status,
             "confidence": self.confidence,
             "probability_none": self.probability_none,
             "calibrated": self.is_calibrated,
-            "belief": self.belief and {**asdict(self.belief), "ruled_out": sorted(self.belief.ruled_out)},
+            "belief": _belief_json(self.belief) if self.is_believed else None,
             "error": self.error,
             "cloud": self.cloud,
             "pano": self.pano,
@@ -276,12 +297,13 @@ class Result:
                 "best_pose": document if document["status"] == LOCALIZED else document["best_guess"],
                 "source": {f.name: document[f.name] for f in fields(Source)},
                 "cameras": (),
+                "belief": document["belief"] or asdict(NOTHING),
                 "alternatives": [{**one, "pose": one} for one in document["alternatives"]],
                 "covariance": matrix and {"matrix": matrix, "least_constrained_direction": about},
                 "height_above_floor": document["height_above_floor_m"],
                 "walk": walk,
             }
-            plain = {f.name: document[f.name] for f in fields(cls) if f.name not in made}
+            plain = {f.name: document[f.name] for f in fields(cls) if f.compare and f.name not in made}
             result = convert(plain | made, cls, dec_hook=lambda _, rows: np.array(rows, np.float64))
             for pose in result.poses:
                 check_pose(pose, "result", MAX_ROTATION_ERROR)
@@ -289,42 +311,13 @@ class Result:
             return replace(result, cameras=read_mounts(camera) if camera else ())
 
 
-def with_localization(result: Result, found: Localization) -> Result:
-    """Return a result with what was found, and its warnings added."""
-    own = {f.name for f in fields(result)} - {"warnings", "cameras"}
-    values = {f.name: getattr(found, f.name) for f in fields(found) if f.name in own}
-    return replace(
-        result,
-        best_pose=found.pose,
-        confidence=found.confidence,
-        probability_none=found.probability_none,
-        warnings=result.warnings + found.warnings,
-        **values,
-    )
+def nothing_found(*warnings: str, belief: Belief = NOTHING) -> Result:
+    """Return the result of a photo for which no pose was found, with warnings that say why."""
+    return Result(probability_none=1.0, warnings=warnings, belief=belief)
 
 
-def localization_of(result: Result) -> Localization:
-    """Return what was found of a photo, without warnings and cameras, from its result."""
-    own = {f.name for f in fields(result)} - {"warnings", "cameras", "belief"}
-    values = {f.name: getattr(result, f.name) for f in fields(Localization) if f.name in own}
-    return Localization(pose=result.best_pose, belief=result.belief or NOTHING, **values)
-
-
-def describe_failure(error: Exception) -> str:
-    """Return in one line why a photo has no result; an error of none, but of the program, is raised."""
-    if isinstance(error, OSError | InputError):
-        return text_of(error)
-    if is_shortage(error):
-        return f"not enough memory ({' '.join(str(error).split()) or 'none is left'})"
-    raise error
-
-
-def unreadable_result(
-    error: str, cloud: str | tuple[str, ...], pano: str, is_passing: bool = False, **more: Any
-) -> Result:
-    """Return the result of a photo that can't be read, or could not at the moment; `more` as in Result."""
-    status = FAILED if is_passing else UNREADABLE
-    return Result(status, 0.0, cloud, pano, error=error, **more)
+def _belief_json(belief: Belief) -> dict[str, object]:
+    return {**asdict(belief), "ruled_out": sorted(belief.ruled_out)}
 
 
 def _pose_json(pose: Pose | None) -> dict[str, object] | None:
@@ -353,44 +346,3 @@ def _place(alternative: Alternative) -> str:
 
 def _in(scan: str | None) -> str:
     return f" ({scan})" if scan else ""
-
-
-def read_results(paths: Sequence[Path]) -> list[Result]:
-    """Return the results in files of JSON lines, their poses checked.
-
-    Raises InputError if a line is no result, or a file has none.
-    """
-    results = []
-    for path in paths:
-        found = parse_lines(path, read_bytes(path, WANTED), _parse_result)
-        if not found:
-            raise InputError(f"{path}: found no result, {WANTED}")
-        results += found
-    return results
-
-
-def check_scan(results: Sequence[Result], cloud_sha256: str, scan: str, is_forced: bool) -> str:
-    """Words on the results of another scan than that of a digest, if any; without force an InputError."""
-    others = [r for r in results if r.source.cloud_sha256 not in (None, cloud_sha256)] if cloud_sha256 else []
-    if not others:
-        return ""
-    words = f"found {len(others)} of {len(results)} results of another scan than {scan}"
-    if not is_forced:
-        first = f"the first of {others[0].cloud_name}"
-        raise InputError(f"{others[0].pano}: {words}, {first}, wanted this scan, or `force`")
-    return words
-
-
-def _parse_result(text: str) -> Result:
-    """Return the result of a line; names and numbers that can't be written are refused."""
-    result = Result.from_json(text)
-    texts = {"status": result.status, "cloud": result.cloud_name, "scan": result.scan or ""}
-    for label, value in texts.items():
-        if UNPRINTABLE.search(value):
-            raise InputError(f"result: found {label} {value!r}, wanted text on one line")
-    if NO_NAME.search(result.pano):
-        raise InputError(f"result: found pano {result.pano!r}, wanted a file's name as os.fsdecode gives it")
-    values = [result.confidence, *([result.evidence.score] if result.evidence else [])]
-    if not all(map(math.isfinite, values)):
-        raise InputError(f"result: found confidence and score {values}, wanted finite numbers")
-    return result

@@ -1,15 +1,10 @@
-"""Results of a method for one panorama."""
+"""The parts of a photo's result: evidence, alternatives, what a camera or a walk tells."""
 
 import math
 from dataclasses import dataclass, replace
 
-from ..camera import Mount
 from ..geometry.pose import Pose
-from ..geometry.pose_gaussian import PoseGaussian
-from .belief import NOTHING, Belief, decide
 from .consensus import Opinion
-from .pose_covariance import PoseCovariance
-from .probability import NOT_LOCALIZED, Standing
 
 
 @dataclass(frozen=True)
@@ -90,42 +85,46 @@ class SphereGeometry:
 
 
 @dataclass(frozen=True)
-class Localization:
-    """The best pose for one panorama, in world coordinates, and the evidence for and against it."""
+class Source:
+    """Which scan and which photo a result is of; None where that is not known."""
 
-    status: str = NOT_LOCALIZED
-    belief: Belief = NOTHING  # in the pose and the alternatives
-    pose: Pose | None = None  # None, as are loss to covariance, if nothing was searched
-    loss: float | None = None
-    evidence: Evidence | None = None
-    alternatives: tuple[Alternative, ...] = ()  # poses elsewhere, best first
-    covariance: PoseCovariance | None = None
-    warnings: tuple[str, ...] = ()  # one line each: why there is no pose, or to doubt it
-    cameras: tuple[Mount, ...] = ()  # of a photo whose focal length was fitted: the camera found
-    focal_length: FocalLength | None = None  # of such a photo
-    sphere: SphereGeometry | None = None  # of a panorama that is not as it claims
-    scan: str | None = None  # as of Alternative
-    storey: int | None = None  # of the pose, 1 the lowest; None where no floor was found
-    height_above_floor: float | None = None  # [m] of the pose, above the floor there
-    # not in results:
-    gaussian: PoseGaussian | None = None  # pose and covariance, in the map
-    std_of_fit: float | None = None  # [m] largest deviation if focal length and stitching were exact
-    standings: tuple[Standing, ...] = ()  # evidence for the pose and each alternative
+    cloud_sha256: str | None = None  # of the scan's file; of several, of their sorted digests, one a line
+    pano_sha256: str | None = None  # of the photo's file; of cube faces, of their digests in order
+    image_size: tuple[int, int] | None = None  # width and height of the picture as it is stored [px]
+    capture_time: str | None = None  # by EXIF, ISO 8601, with the offset from UTC if EXIF has it
 
-    @property
-    def confidence(self) -> float:
-        """Probability of the best pose; 0 if there is none."""
-        best, *others = self.belief.probabilities.tolist()
-        return float(best) if others else 0.0
 
-    @property
-    def probability_none(self) -> float:
-        """Probability that no pose listed is right."""
-        return float(self.belief.probabilities[-1])
+@dataclass(frozen=True)
+class Beside:
+    """A second look at a photo, beside others of a batch."""
 
-    def take_belief(self, belief: Belief, min_confidence: float) -> "Localization":
-        """Return this with what is believed of its pose and its alternatives, and the status that follows."""
-        status, probabilities = decide(belief, min_confidence)
-        pairs = zip(self.alternatives, probabilities[1:-1].tolist(), strict=True)
-        others = tuple(replace(alternative, probability=p) for alternative, p in pairs)
-        return replace(self, status=status, belief=belief, alternatives=others)
+    photos: tuple[str, ...]  # paths of those that show the same, those with the most matches first
+    asked_sha256: str  # digest of all that were asked
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A part of a walk that nobody can have walked: a lift, a cut, a camera in a pocket."""
+
+    distance: float  # [m]
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Alone:
+    """The result of a frame localized alone."""
+
+    status: str
+    confidence: float
+    pose: Pose | None  # in the world
+
+
+@dataclass(frozen=True)
+class WalkFrame:
+    """A frame's place in a walk."""
+
+    time: float  # [s] from the walk's beginning; of frames without times their number
+    frame: int  # from 0
+    how: str  # where its pose comes from: "alone", "tracked", "near", or "none"
+    alone: Alone | None  # if it was searched without regard to the others
+    gap: Gap | None  # before it; None without times

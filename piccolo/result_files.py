@@ -1,0 +1,54 @@
+"""Results in files of JSON lines."""
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from .errors import UNPRINTABLE, InputError
+from .files.json_file import parse_lines, read_bytes
+from .judge.result import Result
+
+NO_NAME = re.compile("[\ud800-\udc7f\udd00-\udfff]")  # what os.fsdecode never gives
+WANTED = "wanted JSON lines of localize.py"
+
+
+def read_results(paths: Sequence[Path]) -> list[Result]:
+    """Return the results in files of JSON lines, their poses checked.
+
+    Raises InputError if a line is no result, or a file has none.
+    """
+    results = []
+    for path in paths:
+        found = parse_lines(path, read_bytes(path, WANTED), _parse_result)
+        if not found:
+            raise InputError(f"{path}: found no result, {WANTED}")
+        results += found
+    return results
+
+
+def check_scan(results: Sequence[Result], cloud_sha256: str, scan: str, is_forced: bool) -> str:
+    """Words on the results of another scan than that of a digest, if any; without force an InputError."""
+    others = [r for r in results if r.source.cloud_sha256 not in (None, cloud_sha256)] if cloud_sha256 else []
+    if not others:
+        return ""
+    words = f"found {len(others)} of {len(results)} results of another scan than {scan}"
+    if not is_forced:
+        first = f"the first of {others[0].cloud_name}"
+        raise InputError(f"{others[0].pano}: {words}, {first}, wanted this scan, or `force`")
+    return words
+
+
+def _parse_result(text: str) -> Result:
+    """Return the result of a line; names and numbers that can't be written are refused."""
+    result = Result.from_json(text)
+    texts = {"status": result.status, "cloud": result.cloud_name, "scan": result.scan or ""}
+    for label, value in texts.items():
+        if UNPRINTABLE.search(value):
+            raise InputError(f"result: found {label} {value!r}, wanted text on one line")
+    if NO_NAME.search(result.pano):
+        raise InputError(f"result: found pano {result.pano!r}, wanted a file's name as os.fsdecode gives it")
+    values = [result.confidence, *([result.evidence.score] if result.evidence else [])]
+    if not all(map(math.isfinite, values)):
+        raise InputError(f"result: found confidence and score {values}, wanted finite numbers")
+    return result

@@ -1,0 +1,35 @@
+"""The photo of a result, read again as when it was localized."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from .camera import Calibration
+from .geometry.colors import Labels
+from .judge.result import Result
+from .panorama import Panorama, read_panorama
+from .photo import Photo
+
+
+def photo_of(result: Result, path: Path | None = None) -> Photo:
+    """Return the photo of a result as it was read when it was localized, without masks; at another path."""
+    picture = path or result.pano
+    if result.cameras:
+        return Photo(picture).with_calibration(Calibration("the result", result.cameras))
+    how: Any = result.settings.get("panorama") or {}
+    given = {name: how.get(name) for name in ("fov_deg", "projection", "cube_order")}
+    return Photo(picture, **given)
+
+
+def read_as_localized(result: Result) -> Panorama:
+    """Read the photo of a result as when it was localized: not valid is what was masked then."""
+    how: Any = result.settings.get("panorama") or {}
+    nadir_deg = float(how.get("mask_nadir_deg") or 0.0)
+    photo = replace(photo_of(result), mask=how.get("mask"), mask_nadir_deg=nadir_deg)
+    return read_panorama(photo, labels_of(result))
+
+
+def labels_of(result: Result) -> Labels | None:
+    """Return how the labels of a result's photo were read; None for colours."""
+    how: Any = result.settings.get("panorama") or {}
+    return Labels(tuple(how["labels"]["ignored"])) if how.get("labels") else None
