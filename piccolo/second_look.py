@@ -32,7 +32,7 @@ def place_keypoints(
         digest = read_photo_facts(photo).sha256
     if digest != result.source.pano_sha256 or result.best_pose is None:
         return None
-    problem = prepare_problem(picture, scan_map, settings.prior, settings.gravity)
+    problem = prepare_problem(picture, scan_map, settings.prior, settings.gravity, settings.method)
     return place_sure(problem, result.best_pose, result.covariance, result.confidence, workers)
 
 

@@ -85,10 +85,10 @@ def _shared_folder(tmp_path_factory):
 def read_by(monkeypatch):
     """Let files of points be read in chunks of so many points, and those of text in so many bytes."""
 
-    def shrink(num_points, num_bytes=text.BLOCK):
+    def shrink(num_points, num_bytes=text.BYTES_AT_ONCE):
         for module in (reader, las, e57, mesh):
-            monkeypatch.setattr(module, "CHUNK", num_points)
-        monkeypatch.setattr(text, "BLOCK", num_bytes)
+            monkeypatch.setattr(module, "POINTS_A_CHUNK", num_points)
+        monkeypatch.setattr(text, "BYTES_AT_ONCE", num_bytes)
 
     return shrink
 

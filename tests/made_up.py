@@ -9,7 +9,7 @@ from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.judge.alternatives import Hypothesis
 from piccolo.judge.candidate import Candidate, Comparison, Selection
 from piccolo.local_features.matching import Matches
-from piccolo.optimize.channel_loss import CHANCE
+from piccolo.optimize.channel_loss import CHANCE_CORRELATION
 from piccolo.photo import NOTHING_KNOWN
 from piccolo.problem.problem import Problem
 from piccolo.problem.profile import PROFILES
@@ -63,7 +63,7 @@ def places(candidates):
 
 def seen(explains, num_blocks=4):
     """A comparison that explains a part of each of some blocks of a hundredth of the sphere."""
-    beyond = CHANCE + (1.0 - CHANCE) * explains
+    beyond = CHANCE_CORRELATION + (1.0 - CHANCE_CORRELATION) * explains
     area = np.full(num_blocks, 0.01)
     return Comparison(np.full(num_blocks, beyond), area, area, 0.01 * num_blocks)
 

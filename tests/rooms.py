@@ -128,7 +128,7 @@ def as_panorama(rgb):
 
 def ask(panorama, scan_map, settings=AUTO):
     """The problem of a panorama in a map."""
-    return prepare_problem(panorama, scan_map, settings.prior, settings.gravity)
+    return prepare_problem(panorama, scan_map, settings.prior, settings.gravity, settings.method)
 
 
 def means(settings=AUTO, workers=WORKERS):

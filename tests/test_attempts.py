@@ -24,7 +24,8 @@ from piccolo.localization.means import NO_TRACE
 from piccolo.localization.search import search_poses
 from piccolo.panorama import GPano, Panorama
 from piccolo.photo import Prior
-from piccolo.problem.photo_images import ACROSS
+from piccolo.problem.method import METHOD
+from piccolo.problem.photo_images import MIRROR
 from piccolo.problem.problem import Features
 from piccolo.problem.settings import CoarseToFineSettings, Effort
 from research.synthetic.world import mask_outside_field
@@ -98,8 +99,8 @@ def test_of_a_clear_photo_the_mirrored_one_must_start_a_tenth_worse(is_turned):
     search_poses(problem, "known", EFFORT.brief(), once)
     searched, by_one = ([label for label, _ in done].count("search") for done in (asked, own))
     assert searched == (1 if is_turned else 2) * by_one
-    assert attempts.beats_mirror(0.55, 0.5)
-    assert not attempts.beats_mirror(0.54, 0.5)
+    assert attempts.beats_mirror(METHOD, 0.55, 0.5)
+    assert not attempts.beats_mirror(METHOD, 0.54, 0.5)
 
 
 def test_the_mirrored_problem_is_that_of_the_mirrored_photo():
@@ -117,7 +118,7 @@ def test_the_mirrored_problem_is_that_of_the_mirrored_photo():
     np.testing.assert_array_equal(mirror.photo.panorama.is_valid, other.photo.panorama.is_valid)
     R = exp_so3(np.array([0.1, -0.2, 0.3]))
     (turned,) = replace(tilted, rotations=R[None]).mirror().rotations
-    np.testing.assert_allclose(turned, ACROSS @ R @ ACROSS)
+    np.testing.assert_allclose(turned, MIRROR @ R @ MIRROR)
     assert mirror.prior == Prior()
     d = np.array([0.6, -0.2, 0.77])
     across = np.array([1.0, -1.0, 1.0])

@@ -14,7 +14,7 @@ from piccolo.geometry.pose import Pose
 from piccolo.geometry.pose_gaussian import LIKELY, PoseGaussian, subtract
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.judge.belief import make_belief
-from piccolo.judge.candidate import NOTHING
+from piccolo.judge.candidate import NO_CHOICE
 from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result, nothing_found
 from piccolo.local_features.hypotheses import exact_pose
@@ -91,7 +91,7 @@ def _fused(judged, of_photo, settings=rooms.UNKNOWN, fit=None):
     matches = _matches_of(_true_pose(), 1e-3, np.random.default_rng(1))
     located = verification.Located(_beside().keypoints, _beside().ranges, of_photo.pose)
     other = Neighbor("b", SurePhoto(located, 0.99, of_photo), matches, _true_pose())
-    return fuse(judged, other, Found(replace(_problem(), prior=settings.prior), NOTHING, fit))
+    return fuse(judged, other, Found(replace(_problem(), prior=settings.prior), NO_CHOICE, fit))
 
 
 def test_a_pose_is_averaged_with_that_by_a_photo_beside():

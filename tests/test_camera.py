@@ -14,7 +14,7 @@ from rooms import room
 
 from piccolo.camera import Camera, Mount
 from piccolo.camera.model import CUT_SPHERE, MODELS, camera_of_fov, pinhole
-from piccolo.camera.resampling import MAX_SIDE, View, make_sphere, shrunk, sphere_width
+from piccolo.camera.resampling import MAX_REMAP_SIDE, View, make_sphere, shrunk, sphere_width
 from piccolo.errors import InputError
 from piccolo.geometry.pose import OPTICAL_FROM_CAM, exp_so3
 from piccolo.geometry.sphere import pixel_rays
@@ -301,6 +301,6 @@ def test_a_picture_is_made_smaller_once_for_calibrations_that_differ_a_little(ch
 
 
 def test_a_picture_too_long_to_be_sampled_is_always_made_smaller():
-    camera = pinhole(MAX_SIDE + 100, 10, 100.0)
-    view = View(Mount(camera), np.zeros((10, MAX_SIDE + 100, 4), np.uint8))
-    assert shrunk(view).pixels.shape[1] == MAX_SIDE
+    camera = pinhole(MAX_REMAP_SIDE + 100, 10, 100.0)
+    view = View(Mount(camera), np.zeros((10, MAX_REMAP_SIDE + 100, 4), np.uint8))
+    assert shrunk(view).pixels.shape[1] == MAX_REMAP_SIDE

@@ -128,7 +128,7 @@ def test_poses_near_one_place_share_what_is_drawn_and_no_others():
     assert sums[0] is sums[1]
     assert views.averages.cache_info().misses == 2
     np.testing.assert_array_equal(sums[0], average_view(octree, places[0], FINE))
-    for k in range(points_around.NUM_VIEWS):
+    for k in range(points_around.NUM_KEPT_VIEWS):
         views.averages((0.01 * k, 0.5, 0.3), FINE)
     assert views.averages(places[0], FINE) is not sums[0]  # only the last are kept
 

@@ -9,7 +9,7 @@ import pytest
 from piccolo.geometry.pose import Pose, exp_so3, step
 from piccolo.optimize import channel_loss
 from piccolo.optimize.levenberg_marquardt import levenberg_marquardt, retract, solve_damped
-from piccolo.optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX, NUM_SUMS
+from piccolo.optimize.normal_equations import COUNT_SUM, GRADIENT, LOSS, MATRIX, NUM_SUMS
 from piccolo.panorama.texels import pack_texels
 
 TILTED = Pose(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.2, -0.3, 0.1]))
@@ -74,7 +74,7 @@ def test_matrix_is_that_of_the_weighted_jacobian():
 def test_a_point_on_masked_pixels_costs_half_of_the_most_it_could():
     problem = _problem()
     sums = _sums(problem, TILTED, np.zeros(problem[3].shape[:2], dtype=bool))
-    assert sums[COUNT] == 0
+    assert sums[COUNT_SUM] == 0
     assert sums[LOSS] == pytest.approx(0.25 * SCALE**2 * problem[2].sum(), rel=1e-6)
     assert (sums[GRADIENT:] == 0).all()
 
@@ -150,9 +150,13 @@ def _score(shown, levels, weights, blocks):
         w, a, b = weights[blocks == block], levels[:, blocks == block], shown[:, blocks == block]
         a = a - np.average(a, axis=1, weights=w)[:, None]
         b = b - np.average(b, axis=1, weights=w)[:, None]
-        variances = [max((w * x * x).sum() / w.sum(), channel_loss.FLAT**2) for x in (a, b)]
+        variances = [max((w * x * x).sum() / w.sum(), channel_loss.FLAT_BLOCK**2) for x in (a, b)]
         correlation = (w * a * b).sum() / w.sum() / math.sqrt(variances[0] * variances[1])
-        total += max(correlation - channel_loss.CHANCE, 0) / (1 - channel_loss.CHANCE) * w.sum()
+        total += (
+            max(correlation - channel_loss.CHANCE_CORRELATION, 0)
+            / (1 - channel_loss.CHANCE_CORRELATION)
+            * w.sum()
+        )
     return total
 
 

@@ -341,7 +341,7 @@ MESHES = {
 def few_points():
     """Few points of a mesh that a flipped bit has made huge."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("piccolo.cloud.readers.mesh.MAX_POINTS", 20_000)
+        patch.setattr("piccolo.cloud.readers.mesh.MAX_MESH_POINTS", 20_000)
         yield
 
 

@@ -96,7 +96,7 @@ def test_8_bit_colors_in_16_bit_fields_are_told_of(tmp_path, is_compressed):
 @pytest.mark.parametrize("is_compressed", [False, True])
 def test_the_sample_is_spread_over_the_file(tmp_path, monkeypatch, is_compressed):
     """128 of 1200 points, in 8 runs or from 4 chunks of 30."""
-    monkeypatch.setattr(las, "MAX_SAMPLES", 128)
+    monkeypatch.setattr(las, "MAX_LAS_SAMPLES", 128)
     monkeypatch.setattr(las, "NUM_SAMPLE_RUNS", 8)
 
     def written(index, value):

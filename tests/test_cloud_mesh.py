@@ -186,7 +186,7 @@ def test_chunks_and_readings_change_no_bit(tmp_path, read_by):
 
 
 def test_too_many_points_lower_the_density(tmp_path, monkeypatch):
-    monkeypatch.setattr(mesh_module, "MAX_POINTS", 2000)
+    monkeypatch.setattr(mesh_module, "MAX_MESH_POINTS", 2000)
     source = open_mesh(made.write_obj(tmp_path))
     assert source.num_points == 2000
     assert "1 square metres of surface, sampled with 2e+03 points" in source.warnings[0]

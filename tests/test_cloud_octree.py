@@ -66,7 +66,7 @@ def test_a_larger_index_names_the_same_rows_and_the_table_may_be_fed_with_nothin
         assert sorted(names[names > 0]) == list(range(1, 41))
     more = np.vstack([rows, rows])
     assert voxel_table.add_points(raw.points_world[:40], raw.colors, base, larger, more, 40) == (40, 40)
-    np.testing.assert_array_equal(more[:, voxel_table.COUNT], np.repeat([2, 1], 40))
+    np.testing.assert_array_equal(more[:, voxel_table.COUNT_COLUMN], np.repeat([2, 1], 40))
     table = voxel_table.VoxelTable("a")
     table.add(np.empty((0, 3)), np.empty((0, 3), np.uint8))
     table.add(np.full((2, 3), 7.5), np.full((2, 3), 51, np.uint8))
@@ -85,7 +85,7 @@ def test_a_full_voxel_takes_no_more_and_fits_its_sums(monkeypatch):
     done = add(points, colors, np.zeros(3, np.int64), index, rows, 0)
     assert done == (5, 1)
     row = rows[0]
-    assert row[voxel_table.COUNT] == 3
+    assert row[voxel_table.COUNT_COLUMN] == 3
     assert row[voxel_table.POSITION] == 3 * ((128 + voxel_table.PHASE) % 256)
     assert voxel_table.MAX_COUNT * max(255, voxel_table.QUANTUM_MASK) <= np.iinfo(np.int32).max
 
@@ -152,7 +152,7 @@ def test_voxels_and_their_means_are_the_same_in_parts(monkeypatch, num):
     points, colors = _cloud(3000)
     whole = _octree(points, colors)
     for module in (octree_module, voxel_table):
-        monkeypatch.setattr(module, "AT_ONCE", num)
+        monkeypatch.setattr(module, "VOXELS_AT_ONCE", num)
     for values, others in zip(_octree(points, colors), whole, strict=True):
         np.testing.assert_array_equal(values, others)
 

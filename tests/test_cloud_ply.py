@@ -154,7 +154,7 @@ def test_lists_before_and_in_the_vertices_are_passed_over(tmp_path, monkeypatch,
     expected = read_cloud(write(tmp_path / "a.ply", vertices()))
     path = tmp_path / "b.ply"
     path.write_bytes(with_lists(order))
-    monkeypatch.setattr(ply, "MAX_ROW_SIZE", 256)
+    monkeypatch.setattr(ply, "MAX_VERTEX_SIZE", 256)
     read = read_cloud(path)
     np.testing.assert_array_equal(read.points, expected.points)
     np.testing.assert_array_equal(read.colors, expected.colors)

@@ -41,4 +41,4 @@ def test_what_has_no_plane_is_left_out():
     octree = build_octree(rooms.voxels(points))
     found = profiles.measure_profiles(octree, choose_leaves(octree), 0.2, Workers())
     assert found.places.shape == (0, 3)
-    assert found.counts.shape == (0, 4, 2 * profiles.NUM_BINS + 1)
+    assert found.counts.shape == (0, 4, 2 * profiles.NUM_PROFILE_BINS + 1)

@@ -47,9 +47,9 @@ WIDTH = 512
 def _coarse():
     """Photos are aligned by fewer points and pixels, which is enough for a room."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(alignment, "LEAST_POINTS", 5000)
+        patch.setattr(alignment, "LEAST_ALIGNED_POINTS", 5000)
         patch.setattr(alignment, "POINTS_PER_PHOTO", 0)
-        patch.setattr(alignment, "WIDTHS", (512, 1024))
+        patch.setattr(alignment, "ALIGNMENT_WIDTHS", (512, 1024))
         yield
 
 
@@ -205,7 +205,7 @@ def test_a_photo_sees_the_paint_of_others_alone(tmp_path, monkeypatch):
 
 
 def test_a_stranger_is_not_localized_by_its_own_paint(tmp_path, monkeypatch):
-    monkeypatch.setattr(color_scan, "NUM_ROUNDS", 1)
+    monkeypatch.setattr(color_scan, "NUM_COLORING_ROUNDS", 1)
     scan_map = _gray_map(rooms.room(SEED, 200_000)[1])
     settings = rooms.KNOWN
     right = [rooms.query(SEED, index=k, width=WIDTH) for k in range(2)]

@@ -16,9 +16,10 @@ from piccolo.geometry.sphere import BLOCK_RINGS, find_cell, pixel_rays, solid_an
 from piccolo.judge.candidate import CONTRADICTS, Comparison
 from piccolo.judge.selection import is_mirrored
 from piccolo.localization.mirror import find_mirrored, is_found_again, list_mirrored
-from piccolo.optimize.channel_loss import CHANCE, NUM_BLOCKS
+from piccolo.optimize.channel_loss import CHANCE_CORRELATION, NUM_BLOCKS
 from piccolo.panorama import Panorama
 from piccolo.panorama.texels import pack_texels
+from piccolo.problem.method import METHOD
 from research.synthetic.world import mask_outside_field, occlude
 
 WIDTH = rooms.WIDTH
@@ -87,7 +88,7 @@ def test_blocks_correlate_as_their_twin():
 
 def test_score_and_ratio_by_hand():
     """Blocks below chance give nothing; only what both poses show is compared."""
-    half = CHANCE + 0.5 * (1 - CHANCE)
+    half = CHANCE_CORRELATION + 0.5 * (1 - CHANCE_CORRELATION)
     area = np.array([0.2, 0.1, 0.1])
     a = Comparison(np.array([half, 0.1, -0.9]), area, area, 0.5)
     assert a.score == pytest.approx(0.5 * 0.2 / 0.5)
@@ -134,7 +135,12 @@ def test_an_occluder_costs_what_it_hides(fraction):
     rgb, is_hidden = _hidden(fraction)
     behind = comparison.compare(_problem(rgb), true_pose)
     touched = _blocks_of(is_hidden)
-    lost = ((touched > 0.02) * seen.area * np.maximum(seen.correlation - CHANCE, 0) / (1 - CHANCE)).sum()
+    lost = (
+        (touched > 0.02)
+        * seen.area
+        * np.maximum(seen.correlation - CHANCE_CORRELATION, 0)
+        / (1 - CHANCE_CORRELATION)
+    ).sum()
     assert behind.score >= seen.score - lost - 0.02
     assert behind.score < seen.score - 0.3 * fraction * seen.score
     untouched = (touched == 0.0) & (seen.area > 0.0)
@@ -183,7 +189,7 @@ def test_what_contradicts_is_masked_and_the_rest_stays():
 
 def _is_turned_over(problem, best):
     mirrored = find_mirrored(problem, best, rooms.AUTO.effort, rooms.WORKERS)
-    return is_mirrored(count_agreeing(problem, best, rooms.WORKERS), mirrored)
+    return is_mirrored(METHOD, count_agreeing(problem, best, rooms.WORKERS), mirrored)
 
 
 @pytest.mark.parametrize(("fov_deg", "asks_map"), [(None, True), (None, False), (90.0, True)])
@@ -215,8 +221,8 @@ def test_a_photo_that_was_turned_over_is_told(fov_deg, asks_map):
 def test_a_photo_that_views_explain_as_well_is_not_mirrored_by_its_matches(score, num_matches, expected):
     """The mirrored photo has more matches, as in a place that looks alike in a mirror."""
     own = make_candidate(0.0, 0.5, 20)
-    assert is_mirrored(own, make_candidate(0.0, score, num_matches)) == expected
-    assert not is_mirrored(own, None)
+    assert is_mirrored(METHOD, own, make_candidate(0.0, score, num_matches)) == expected
+    assert not is_mirrored(METHOD, own, None)
 
 
 def test_the_mirrored_photo_is_searched_as_thoroughly_as_its_own_pose_needs():

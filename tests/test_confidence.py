@@ -26,7 +26,7 @@ MODEL = rule.ChoiceModel((3.0, 1.0, 2.0), (10.0, 2.0))
 def test_probabilities_are_those_of_the_formula_and_add_up_to_one():
     """A conditional logit by a pocket calculator, with made-up weights."""
     standings = [Standing(*values, "drawn scan") for values in ((1.0, 0.5, 12), (0.5, 0.1, 2))]
-    p = posterior(standings, 0.01, MODEL)
+    p = posterior(standings, 0.01, model=MODEL)
     e = math.exp
     odds = [0.5 * 20.0**2, 0.5**3 * 0.1 * 10.0**2, e(10.0 - 2.0 * 2.0)]
     np.testing.assert_allclose(p, np.array(odds) / sum(odds), rtol=1e-12)

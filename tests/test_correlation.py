@@ -94,7 +94,7 @@ def test_centered_correlations_equal_their_twin(seed, has_edges):
         features.reshape(len(features), -1), seen, panorama, Workers(2), is_centered=True
     )
     expected = naive.centered_correlation(
-        features, seen / 255, samples, validity, WIDE_AREA, correlation.FLAT, correlation.LEAST_SEEN
+        features, seen / 255, samples, validity, WIDE_AREA, correlation.FLAT_VIEW, correlation.LEAST_SEEN
     )
     np.testing.assert_allclose(found, expected, atol=0.02)
     own = np.arange(20)  # the views with the least noise

@@ -57,7 +57,7 @@ def _photo(path):
 
 @pytest.mark.parametrize("width", [640, 400])
 def test_dots_of_a_photo_are_where_the_pinhole_that_is_read_back_projects_them(tmp_path, width, monkeypatch):
-    monkeypatch.setattr(rerun_file, "MAX_WIDTH", width)
+    monkeypatch.setattr(rerun_file, "MAX_RERUN_WIDTH", width)
     photo = result(_photo(tmp_path / "a b.jpg"), POSE, cameras=(Mount(PHOTO),))
     options = Options(images=tmp_path, offset=tuple(ORIGIN))
     assert export([photo], "rerun", tmp_path / "x.rrd", options) == {}

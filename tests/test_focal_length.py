@@ -29,6 +29,7 @@ from piccolo.localization.calibration import follow_matches, recalibrate
 from piccolo.localization.localize import select_likeliest
 from piccolo.panorama import read_panorama
 from piccolo.photo import Photo
+from piccolo.problem.method import METHOD
 from research.synthetic.world import render_picture
 
 TRUE = 160.0  # [px] of the photos here, 320 x 240
@@ -175,7 +176,7 @@ def test_matches_lead_to_a_focal_length_that_is_far_off():
     assert problem.given.cameras[0].camera.focal[0] == pytest.approx(TRUE, rel=0.05)
     assert found.best.pose.distance(scan().from_world(pose)) < 0.15
     matches = focal.list_matches(problem, found.best, rooms.WORKERS)
-    by_matches = fit_matches(problem.given.cameras[0], found.best.pose, matches, focal.FOCAL_WIDTHS)
+    by_matches = fit_matches(METHOD, problem.given.cameras[0], found.best.pose, matches, focal.FOCAL_WIDTHS)
     assert abs(by_matches.values[0]) < 2.5 / math.sqrt(by_matches.information)
     assert follow_matches(problem, found, rooms.WORKERS) == (problem, found)
 

@@ -145,3 +145,31 @@ def test_one_module_makes_statuses():
     results = [node for path, node in calls if node.func.id == "Result" and path != "photo_reader.py"]
     assert len(results) > 2
     assert not any(node.args or "status" in [k.arg for k in node.keywords] for node in results)
+
+
+def _is_numeric(value):
+    """True for numbers, their tuples, and what NumPy and `math` make of them."""
+    kinds = ast.Dict, ast.DictComp, ast.Set, ast.Lambda, ast.JoinedStr
+    constants = [node.value for node in ast.walk(value) if isinstance(node, ast.Constant)]
+    if any(isinstance(node, kinds) for node in ast.walk(value)):
+        return False
+    return bool(constants) and all(isinstance(constant, int | float) for constant in constants)
+
+
+def _list_numbers(path):
+    """The names of a source's constants that are numbers."""
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value and _is_numeric(node.value):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            named = [n.id for target in targets for n in ast.walk(target) if isinstance(n, ast.Name)]
+            yield from filter(str.isupper, named)
+
+
+def test_a_number_has_a_name_of_its_own():
+    """Who reads LEAST_CONFIDENCE in one module must not think of another's; the same thing is imported."""
+    users = {}
+    for module, path in MODULES.items():
+        for name in _list_numbers(path) if module.startswith("piccolo") else ():
+            users.setdefault(name, set()).add(module)
+    assert len(users) > 500
+    assert {name: found for name, found in users.items() if len(found) > 1} == {}

@@ -15,8 +15,8 @@ from piccolo.local_features import feature_map, matching
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import (
     DISTINCT_IN_MAP,
-    FAR,
-    NUM_NEIGHBORS,
+    FARTHEST_DISTANCE,
+    NUM_MATCHED_FEATURES,
     is_distinct,
     match,
     nearest_lists,
@@ -58,7 +58,7 @@ def test_lists_equal_a_search_of_all_where_all_are_looked_through():
     search_lists(descriptors, probes[:, :1], in_map, start, points.astype(np.float32), found, distances)
     of_list = probes[:, :1] == 1  # that is empty
     assert (found[of_list[:, 0]] == -1).all()
-    assert (distances[of_list[:, 0]] == FAR).all()
+    assert (distances[of_list[:, 0]] == FARTHEST_DISTANCE).all()
     lists = np.searchsorted(start, found, side="right") - 1
     assert ((lists == probes[:, :1]) | (found < 0)).all()
 
@@ -92,7 +92,7 @@ def test_components_keep_distances_and_middles_are_of_clusters(monkeypatch):
     gram = components[:, :8].T.astype(float) @ components[:, :8] / 127**2
     np.testing.assert_allclose(gram, np.eye(8), atol=0.03)
     projected = feature_map.project(values, mean, components).astype(float)
-    monkeypatch.setattr(feature_map, "BLOCK", 7)
+    monkeypatch.setattr(feature_map, "DESCRIPTORS_AT_ONCE", 7)
     np.testing.assert_array_equal(feature_map.project(values, mean, components), projected)
     gaps = np.linalg.norm(values[:-1].astype(float) - values[1:], axis=1)
     is_unclipped = np.abs(projected).max(axis=1) < 127
@@ -171,7 +171,7 @@ def test_matches_of_halves_are_those_of_the_whole_numbered_on():
 def test_matches_come_in_the_photos_order_the_distinct_ones_weigh_most(matches):
     assert (np.diff(matches.query) >= 0).all()
     counts = np.bincount(matches.query)
-    assert counts.max() == NUM_NEIGHBORS
+    assert counts.max() == NUM_MATCHED_FEATURES
     is_distinct = matches.weights == 1.0
     assert set(np.unique(matches.weights)) == {0.5, 1.0}
     assert (np.bincount(matches.query[is_distinct]) <= 1).all()

@@ -23,6 +23,7 @@ from piccolo.judge.pose_covariance import describe_errors
 from piccolo.localization.calibration import calibrate_sphere
 from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.panorama import Panorama
+from piccolo.problem.method import METHOD
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.view import Cells
 from research.synthetic.places import make_alike
@@ -75,7 +76,7 @@ def test_hessian_predicts_the_gradient_a_step_away(found):
     image = prepared.photo.images.full()
     levels = covariance.to_levels(points.channels)
     seen = points.offsets, levels, points.weights
-    problem = ChannelProblem(*seen, image.rgbx, image.width, covariance.SCALE)
+    problem = ChannelProblem(*seen, image.rgbx, image.width, covariance.COVARIANCE_SCALE)
     hessian = covariance.compute_hessian(problem, pose, WHOLE.steps[0].turn, 3.0)
     for delta in ([0.001, 0, 0, 0, 0.003, 0], [0, -0.0015, 0.001, 0.003, 0, -0.004]):
         moved = step(pose, np.array(delta))
@@ -195,11 +196,11 @@ def test_halves_that_ask_for_other_poses_score_far_beyond_chance():
     is_ahead = rng.permuted(np.tile(np.arange(150) % 2 == 0, (40, 1)), axis=1)
     by_chance = [covariance.score_halves(block_sums(rng, is_ahead[0], np.zeros(6)), is_ahead) for _ in "1234"]
     assert np.mean(by_chance) == pytest.approx(1.0, abs=0.1)
-    assert np.percentile(by_chance, 95) < covariance.MOST_SCORE
+    assert np.percentile(by_chance, 95) < METHOD.halves_score
     sums = block_sums(rng, is_ahead[7], np.array([0.0, 0, 0, 0, 0, 0.4]))
     scores = covariance.score_halves(sums, is_ahead)
     assert scores.argmax() == 7
-    assert scores[7] > 3.0 * covariance.MOST_SCORE
+    assert scores[7] > 3.0 * METHOD.halves_score
     sums[np.flatnonzero(is_ahead[7])[12:]] = 0.0
     assert covariance.score_halves(sums, is_ahead)[7] == 0.0
 
@@ -213,7 +214,7 @@ def test_a_pose_that_is_not_the_best_of_all_does_not_set_halves_apart():
     expected = covariance.score_halves(sums, is_ahead[None])
     sums[:, 2:8] += covariance.fill_symmetric(sums[:, 8:]) @ np.full(6, 0.01)
     np.testing.assert_allclose(covariance.score_halves(sums, is_ahead[None]), expected, rtol=0.3)
-    assert expected < covariance.MOST_SCORE
+    assert expected < METHOD.halves_score
 
 
 def turn_half(rgb, azimuth, turn):

@@ -110,7 +110,7 @@ def test_work_begins_only_where_errors_can_still_be_raised(address_space):
 
 def test_voxels_and_their_octree_take_what_they_say(monkeypatch):
     for module in (voxels_module, octree):
-        monkeypatch.setattr(module, "AT_ONCE", 1 << 10)
+        monkeypatch.setattr(module, "VOXELS_AT_ONCE", 1 << 10)
     rng, num = np.random.default_rng(0), 200_000
     points, colors = rng.uniform(0, 60, (num, 3)), rng.integers(0, 256, (num, 3), np.uint8)
     kernels_compiled = voxels_module.VoxelTable("a.ply")

@@ -54,7 +54,7 @@ def test_occluders_are_where_the_mask_is_white(contrast):
             photo = _occluded(panorama, number, rng, contrast)
             mask = occlusion.occlusion_mask(points, photo, pose)
             was_scanned = mask != occlusion.NOT_SCANNED
-            is_contradicted = mask == occlusion.CONTRADICTED
+            is_contradicted = mask == occlusion.CONTRADICTED_LEVEL
             overlaps.append(_intersection_over_union(is_contradicted, (number > 0) & was_scanned))
             explained, contradicted = occlusion.compare_occlusion(points, photo, pose).fractions()
             assert contradicted / (explained + contradicted) == pytest.approx(fraction, abs=0.15)
@@ -97,7 +97,7 @@ def test_what_was_not_scanned_or_not_photographed_is_grey():
     photo = Panorama(panorama.rgb, is_valid)
     mask = occlusion.occlusion_mask(half, photo, pose)
     assert mask.shape == panorama.rgb.shape[:2]
-    assert set(np.unique(mask)) <= {occlusion.EXPLAINED, occlusion.NOT_SCANNED, occlusion.CONTRADICTED}
+    assert set(np.unique(mask)) <= {occlusion.EXPLAINED, occlusion.NOT_SCANNED, occlusion.CONTRADICTED_LEVEL}
     assert (mask[:, :256] == occlusion.NOT_SCANNED).all()
     forward = pixel_rays(rooms.WIDTH)[..., 0]
     assert np.mean(mask[forward < -0.1] == occlusion.NOT_SCANNED) > 0.99

@@ -8,7 +8,7 @@ import rooms
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors, rotation_from_quaternion_wxyz, step
 from piccolo.local_features.hypotheses import angular_equations, descend_matches
 from piccolo.local_features.p3p import p3p
-from piccolo.optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX, NUM_SUMS
+from piccolo.optimize.normal_equations import COUNT_SUM, GRADIENT, LOSS, MATRIX, NUM_SUMS
 
 NUM_CASES = 5000
 RESTS = np.array([3.0, -7.0, 1.5])  # [m] the scene's middle, off the origin
@@ -157,7 +157,7 @@ def test_sums_are_those_of_numerical_rows_at_tilted_poses():
         matrix = np.einsum("n,nij,nik->jk", robust, rows, rows)
         gradient = np.einsum("n,nij,ni->j", robust, rows, residuals)
         assert sums[LOSS] == pytest.approx((0.5 * square / (1.0 + square / scale**2)).sum())
-        assert sums[COUNT] == len(points)
+        assert sums[COUNT_SUM] == len(points)
         np.testing.assert_allclose(sums[GRADIENT:MATRIX], gradient, atol=1e-7)
         np.testing.assert_allclose(sums[MATRIX:], matrix[np.triu_indices(6)], atol=1e-6)
         losses = [[_sums((bearings, points, scale), step(pose, s * m))[LOSS] for s in (1, -1)] for m in moves]

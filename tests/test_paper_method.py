@@ -15,7 +15,6 @@ from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.judge.result_parts import Evidence
 from piccolo.panorama.model import shrink
 from piccolo.paper.localize import (
-    MIN_CLEARANCE,
     PROBE_WIDTH,
     PaperSettings,
     color_histogram,
@@ -25,6 +24,7 @@ from piccolo.paper.localize import (
     paper_confidence,
     prepare,
 )
+from piccolo.scan_map.camera_positions import MIN_CLEARANCE
 from piccolo.views.zbuffer import is_free_space
 
 QUICK = dataclasses.replace(PaperSettings(), num_translations=30, max_points=30_000, num_iterations=60)

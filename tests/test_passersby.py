@@ -31,7 +31,9 @@ def test_votes_spread_as_in_numpy():
     guide[:, 30:] = 100.0
     found = np.empty_like(votes)
     spread_votes(votes, guide, found)
-    wanted = naive.spread_votes(votes, guide, passersby.REACH, float(passersby.NEAR), float(passersby.ALIKE))
+    wanted = naive.spread_votes(
+        votes, guide, passersby.VOTE_REACH, float(passersby.VOTE_DEVIATION), float(passersby.ALIKE)
+    )
     assert np.allclose(found, wanted, rtol=1e-4, atol=1e-4)
 
 

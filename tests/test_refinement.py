@@ -20,6 +20,7 @@ from piccolo.localization import beam, ladder
 from piccolo.localization.beam import best_and_alternatives, narrow
 from piccolo.localization.search import Starts
 from piccolo.optimize.channel_loss import NUM_BLOCKS
+from piccolo.problem.method import METHOD
 from piccolo.problem.profile import VIEWS, WHOLE_BEAM
 from piccolo.problem.stages import AROUND_FINE, AROUND_MIDDLE, FULL, LAST, NEARLY, SECOND, Limits, Rounds
 from piccolo.views.points_around import round_position
@@ -47,7 +48,7 @@ def _problem(seed):
     ],
 )
 def test_poses_far_fainter_than_the_best_are_not_compared(scores, kept):
-    found = beam.keep_comparable([at(k, score) for k, score in enumerate(scores)])
+    found = beam.keep_comparable([at(k, score) for k, score in enumerate(scores)], METHOD.faint_part)
     assert sorted((h.score for h in found), reverse=True) == kept
 
 
@@ -87,9 +88,9 @@ def test_the_beam_narrows_from_stage_to_stage():
     centers = np.outer(np.arange(500), [1.0, 0.0, 0.0])
     starts = Starts(np.repeat(np.eye(3)[None], 500, axis=0), centers, np.zeros(500, np.int64))
     found = beam.refine_starts(problem, starts, WHOLE_BEAM, workers)
-    around = len(ladder.perturbations(1.0)) // ladder.PERTURBED_BATCH
+    around = len(ladder.perturbations(METHOD, 1.0)) // ladder.PERTURBED_BATCH
     counts = [total for label, total in asked if label == "descend" and total != around]
-    assert counts == [-(-500 // beam.BATCH), 400 // beam.BATCH, 48, 8, 8, 2, 12]
+    assert counts == [-(-500 // beam.STARTS_A_TASK), 400 // beam.STARTS_A_TASK, 48, 8, 8, 2, 12]
     assert [sum(h.is_climbed for h in found), len(found)] == [2, 12]
     assert [one.first.limits.num_iterations for one in (WHOLE, PARTIAL)] == [5, 12]
     assert SECOND.limits.num_iterations == 12
@@ -110,7 +111,7 @@ def test_poses_are_perturbed_for_as_long_as_that_helps(gains, rounds, expected):
         asked.append(best.score)
         return at(float(len(asked)), scores[len(asked) - 1])
 
-    found = ladder.climb_by(perturb, at(0.0, 0.5))
+    found = ladder.climb_by(perturb, at(0.0, 0.5), METHOD)
     assert found.score == pytest.approx(expected)
     assert len(asked) == rounds
     assert asked == sorted(asked)
@@ -255,7 +256,7 @@ def test_descent_finds_the_true_pose_again():
 def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
     (_, true_pose) = _fine()
     images = _problem(1).photo.images
-    off = step(true_pose, ladder.perturbations(1.0)[1])
+    off = step(true_pose, ladder.perturbations(METHOD, 1.0)[1])
     assert rooms.errors(off, true_pose)[0] > 0.2
     cells = rooms.view(rooms.scan_map(1).octree, off.center_world, VIEWS["fine"], ALL)
     stage = AROUND_MIDDLE._replace(view="fine")

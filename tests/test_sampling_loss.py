@@ -6,7 +6,7 @@ import pytest
 
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import Pose, exp_so3, step, yaw_rotation
-from piccolo.optimize.sampling_loss import BLOCK, sampling_equations, sampling_loss
+from piccolo.optimize.sampling_loss import POINTS_A_SUM, sampling_equations, sampling_loss
 from piccolo.panorama.texels import pack_texels
 
 WIDTH = 256
@@ -54,7 +54,7 @@ CASES = [
 @pytest.mark.parametrize(("name", "where", "is_masked"), CASES)
 def test_loss_equals_its_twin(name, where, is_masked):
     """Over the seam and the poles too; masked pixels are left out of sum and count."""
-    points, colors = _points(where, 3 * BLOCK + 17)
+    points, colors = _points(where, 3 * POINTS_A_SUM + 17)
     image, pose = _smooth_image(), POSES[name]
     is_valid = np.ones(image.shape[:2], dtype=bool)
     if is_masked:

@@ -17,6 +17,7 @@ from piccolo.panorama.gpano import GPano
 from piccolo.panorama.local_normalization import normalize_panorama, sample_channels
 from piccolo.panorama.model import resize
 from piccolo.photo import Photo, Prior
+from piccolo.problem.method import METHOD
 from piccolo.problem.photo_images import make_images
 from piccolo.problem.profile import ImageScales
 from piccolo.problem.settings import Effort
@@ -237,7 +238,7 @@ def test_heading_is_the_worlds_where_the_map_was_levelled(tilts):
 )
 def test_number_of_starts(num_candidates, most, expected):
     """One for every two candidates that are searched, but not fewer and not more than asked for."""
-    assert search.thin_starts(num_candidates, most) == expected
+    assert search.thin_starts(METHOD, num_candidates, most) == expected
 
 
 @pytest.mark.parametrize("most", [20, 150])

@@ -112,10 +112,10 @@ def test_a_slow_upload_is_none_that_stalls(monkeypatch):
     """It takes several times as long as a step of it may take."""
 
     def talk(client):
-        client.sendall(FORM + b"Content-Length: %d\r\n\r\n" % (10 * connections.STEP))
+        client.sendall(FORM + b"Content-Length: %d\r\n\r\n" % (10 * connections.BODY_STEP))
         for _ in range(10):
             time.sleep(STALL_S / 2)
-            client.sendall(bytes(connections.STEP))
+            client.sendall(bytes(connections.BODY_STEP))
         return client.recv(1000)
 
     assert _run(monkeypatch, talk).startswith(b"HTTP/1.1 200 OK")

@@ -26,10 +26,10 @@ from piccolo.geometry.sphere import compute_pixels, pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.views.pictures import encode_image, fill_holes
 from piccolo.views.surfels import (
-    BAND,
     BAND_OFFSET,
     MAX_SLOPE,
     MIN_RADIUS_PX,
+    SURFACE_BAND,
     axes_of_pixels,
     make_surfels,
     render_points,
@@ -85,7 +85,7 @@ def test_splat_equals_its_twin_over_seam_and_poles():
         part = slice(lo, 11 if lo == 0 else 32)
         splat(surfels, packed, extents, *axes, lo, depth[part], sums[:0])
         splat(surfels, packed, extents, *axes, lo, depth[part], sums[part])
-    limits = MIN_RADIUS_PX, MAX_SLOPE, BAND, BAND_OFFSET
+    limits = MIN_RADIUS_PX, MAX_SLOPE, SURFACE_BAND, BAND_OFFSET
     expected_depth, expected_rgb = naive.splat(surfels.astype(float), rgb, 64, *limits)
     is_seen = sums[..., 4] > 0
     assert 0.3 < is_seen.mean() < 1.0

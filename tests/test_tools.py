@@ -1,13 +1,10 @@
 """The measuring tools, on small cases: that they run, and that their tables say what was measured."""
 
-import ast
 import datetime
-import importlib
 import json
-import math
 import re
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import cv2
@@ -20,9 +17,9 @@ from rooms import write_room
 from piccolo.geometry.pose import Pose
 from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.judge.result import Result
-from piccolo.localization import attempts
 from piccolo.panorama import read_panorama
 from piccolo.paper.localize import PaperSettings
+from piccolo.problem.method import METHOD
 from research.evaluation.query_result import QueryResult
 from research.measuring import benchmark, confidence, page, sensitivity, speed
 from research.scene import Query, read_scene, write_queries
@@ -192,50 +189,36 @@ def test_trials_of_a_scene_and_what_is_learnt_from_them(scene, tmp_path, capsys,
     assert benchmark.main(["calibration", "--check", str(tmp_path / "odd.jsonl")]) == 3
 
 
-def test_constants_are_moved_one_at_a_time_and_put_back(scene, capsys, monkeypatch):
-    """Each trial is localized once, whatever the constants are then."""
+def test_numbers_of_the_method_are_moved_one_at_a_time(scene, capsys, monkeypatch):
+    """Each trial is localized once, whatever the numbers are then."""
     localize = sensitivity.localize_trial
     found = {}
     moved = []
 
-    def localize_once(scan_map, trial, workers):
-        moved.append((attempts.FIRST_MIRROR_RATIO, attempts.NUM_MATCHED))
+    def localize_once(scan_map, trial, workers, method):
+        moved.append(method)
         if trial.case not in found:
-            found[trial.case] = localize(scan_map, trial, workers)
+            found[trial.case] = localize(scan_map, trial, workers, method)
         return found[trial.case]
 
     monkeypatch.setattr(sensitivity, "localize_trial", localize_once)
-    few = {"localization.attempts": ("FIRST_MIRROR_RATIO", "NUM_MATCHED")}
-    monkeypatch.setattr(sensitivity, "CONSTANTS", few)
     assert benchmark.main(["sensitivity", "--scenes", str(scene), "--most", "1", "--quiet"]) == 0
     head, _, before, *rows = capsys.readouterr().out.strip().splitlines()
-    assert head == "| constant | right | localized | wrong of these | median [mm] | changed |"
+    assert head == "| number | right | localized | wrong of these | median [mm] | changed |"
     assert re.fullmatch(r"\| as they are \| [12] \| [12] \| 0 \| \d+\.\d\d \| 0 \|", before)
-    names = [f"localization.attempts.{name} x {factor}" for name in few.popitem()[1] for factor in (0.8, 1.2)]
-    assert [row.split(" | ")[0].strip("| ") for row in rows] == names
-    by_run = zip(moved[::2], moved[1::2], strict=True)  # a panorama, and a photo
-    expected = [(1.1, 6), (0.88, 6), (1.32, 6), (1.1, 5), (1.1, 7)]
-    assert [run for run, again in by_run if run == again] == [pytest.approx(pair) for pair in expected]
-    assert (attempts.FIRST_MIRROR_RATIO, attempts.NUM_MATCHED) == (1.1, 6)
+    names = [field.name for field in fields(METHOD)]
+    told = [f"{name} x {factor}" for name in names for factor in (0.8, 1.2)]
+    assert [row.split(" | ")[0].strip("| ") for row in rows] == told
+    by_run = list(zip(moved[::2], moved[1::2], strict=True))  # a panorama, and a photo
+    assert all(run == again for run, again in by_run)
+    changes = [[n for n in names if getattr(run, n) != getattr(METHOD, n)] for run, _ in by_run]
+    assert changes == [[], *([name] for name in names for _ in range(2))]
 
 
-def test_every_constant_that_is_moved_decides_outside_of_kernels():
-    for module, names in sensitivity.CONSTANTS.items():
-        source = (ROOT / "piccolo" / f"{module.replace('.', '/')}.py").read_text()
-        functions = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef)]
-        compiled = [
-            node for node in functions if any("kernel" in ast.unparse(d) for d in node.decorator_list)
-        ]
-        used = {name.id for node in compiled for name in ast.walk(node) if isinstance(name, ast.Name)}
-        assert not used & set(names)
-        for name in names:
-            value = getattr(importlib.import_module(f"piccolo.{module}"), name)
-            assert sensitivity.move(value, name, 0.8) != value != sensitivity.move(value, name, 1.2)
-
-
-def test_a_cosine_is_moved_by_its_angle_and_a_number_by_one_at_least():
-    assert sensitivity.move(math.cos(0.5), "COS_AGREE", 1.2) == pytest.approx(math.cos(0.6))
-    assert (sensitivity.move(2, "NUM", 0.8), sensitivity.move(10, "NUM", 1.2)) == (1, 12)
+def test_a_number_is_moved_by_a_fifth_and_a_whole_one_by_one_at_least():
+    assert sensitivity.move(METHOD, "sure_odds", 1.2).sure_odds == pytest.approx(3.6)
+    assert sensitivity.move(METHOD, "candidates_per_start", 0.8).candidates_per_start == 1
+    assert sensitivity.move(METHOD, "enough_matches", 1.2).enough_matches == 48
 
 
 def test_fuzzing_runs_and_finds_nothing_at_once(tmp_path):

@@ -30,6 +30,7 @@ from piccolo.localization.judging import Found, judge
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import Panorama
 from piccolo.photo import Prior
+from piccolo.problem.method import METHOD
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.zbuffer import visible_points
 from research.synthetic.world import change_light, mask_outside_field, photograph, scan_world
@@ -90,10 +91,10 @@ def _beside():
 
 def test_a_photo_is_matched_with_one_beside_it_on_the_scan():
     matches = verification.match_beside(_problem(), _beside(), WORKERS)
-    agreeing = count_matches(matches, _true_pose(), verification.COS_AGREE)
+    agreeing = count_matches(matches, _true_pose(), METHOD.cos_agree)
     assert agreeing >= 20
     assert (np.diff(matches.query) >= 0).all()
-    assert count_matches(matches, _moved((0.5, -0.4, 0.0)), verification.COS_AGREE) < 0.3 * agreeing
+    assert count_matches(matches, _moved((0.5, -0.4, 0.0)), METHOD.cos_agree) < 0.3 * agreeing
     cloud = np.asarray(rooms.room(1, NUM_POINTS)[1].points)
     nearest = [np.linalg.norm(cloud - point, axis=1).min() for point in matches.points]
     assert np.median(nearest) < 0.05
@@ -104,7 +105,7 @@ def test_what_moves_with_the_camera_is_no_match():
     own = verification.place_keypoints(_problem(), _true_pose(), WORKERS)
     matches = verification.match_beside(_problem(), own, WORKERS)
     assert len(matches.query) < 0.2 * len(_problem().photo.seen(WORKERS).keypoints.rays)
-    assert count_matches(matches, _true_pose(), verification.COS_AGREE) == 0
+    assert count_matches(matches, _true_pose(), METHOD.cos_agree) == 0
 
 
 def test_a_mirrored_photo_has_no_matches_beside():
@@ -222,13 +223,13 @@ def test_matches_give_a_pose_whose_error_they_cover():
     squares = []
     for offset in (SMALL, -SMALL, 0.0 * SMALL):
         start = step(_true_pose(), offset)
-        pose, covariance = verification.place_by_matches(start, _draw(start))
+        pose, covariance = verification.place_by_matches(METHOD, start, _draw(start))
         off = subtract(_true_pose(), pose)
         squares.append(off @ np.linalg.solve(covariance, off))
         assert rooms.errors(pose, _true_pose())[0] < 0.03
     assert max(squares) < LIKELY
     away = _moved((1.0, -0.8, 0.0))
-    assert verification.place_by_matches(away, _draw(away)) is None
+    assert verification.place_by_matches(METHOD, away, _draw(away)) is None
 
 
 def test_a_pose_is_averaged_with_that_by_its_matches_unless_that_contradicts_the_prior():
@@ -298,7 +299,7 @@ def test_matches_lie_on_the_scan_where_the_photo_sees_them():
     offsets = matches.points - true.center_world
     distances = np.linalg.norm(offsets, axis=1)
     rays = offsets @ true.R_cam_from_world.T / distances[:, None]
-    fits = (rays * matches.rays).sum(axis=1) > verification.COS_AGREE
+    fits = (rays * matches.rays).sum(axis=1) > METHOD.cos_agree
     assert fits.sum() >= 20
     np.testing.assert_allclose(np.linalg.norm(matches.directions, axis=1), 1.0, atol=1e-5)
     turned = matches.tangents @ true.R_cam_from_world.T

@@ -12,10 +12,10 @@ from piccolo.evidence import verification
 from piccolo.evidence.examine import examine
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.judge.probability import log_odds
-from piccolo.judge.selection import CHANCE_MATCHES
 from piccolo.localization import ladder, near
 from piccolo.localization.beam import score_briefly, score_mirror
 from piccolo.localization.near import Near
+from piccolo.problem.method import METHOD
 from piccolo.together.walk import tracker
 from piccolo.together.walk.expectation import (
     Expected,
@@ -59,7 +59,7 @@ def _narrow(problem):
 def test_a_descent_goes_on_around_its_end_while_that_helps(seen):
     problem, true = seen
     workers, done = rooms.listen()
-    batches = len(ladder.perturbations(1.0)) // ladder.PERTURBED_BATCH
+    batches = len(ladder.perturbations(METHOD, 1.0)) // ladder.PERTURBED_BATCH
     end = track(problem, true, workers)
     assert pose_errors(end.pose, true)[0] < 0.02
     assert end.log_odds > 4.0
@@ -67,7 +67,7 @@ def test_a_descent_goes_on_around_its_end_while_that_helps(seen):
     far = track(problem, _off(true, 0.6, 20.0), workers)
     assert pose_errors(far.pose, true)[0] < 0.02
     assert track(problem, _off(true, 2.0, 90.0), workers) is None
-    assert 3 < done.count(("descend", batches)) <= 1 + 2 * ladder.MAX_PERTURBATIONS
+    assert 3 < done.count(("descend", batches)) <= 1 + 2 * METHOD.most_perturbations
 
 
 def test_a_camera_is_expected_by_its_motion_before_or_by_an_odometry(seen):
@@ -219,7 +219,7 @@ def test_matches_that_put_a_narrow_photo_elsewhere_count_as_none(seen):
     taken = _narrow(seen[0])
     true = seen[1]
     here = near.assess_end(taken, examine(taken, true), WORKERS)
-    assert here.num_matches > CHANCE_MATCHES
+    assert here.num_matches > METHOD.chance_matches
     for metres, degrees in ((0.25, 0.0), (0.0, 6.0)):
         elsewhere = near.assess_end(taken, examine(taken, _off(true, metres, degrees)), WORKERS)
         assert elsewhere.num_matches == 0

@@ -57,7 +57,8 @@ def describe_changes(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str
 
 def _by_option(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the value of each setting by the name of its option in backticks, or by its own."""
-    values = {name: settings[name] for name in settings if name not in GROUPS}
+    values = {name: settings[name] for name in settings if name not in (*GROUPS, "method")}
+    values |= settings.get("method", {})  # whose numbers no option sets
     values = {f"`{name}`" if name in OPTIONS else name: value for name, value in values.items()}
     grouped = {name: value for group in GROUPS for name, value in settings.get(group, {}).items()}
     return values | {f"`{RENAMED.get(name, name)}`": value for name, value in grouped.items()}

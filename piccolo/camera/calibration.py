@@ -24,7 +24,7 @@ MAX_OFFSET = 0.1  # [m] between cameras that pass for one without a warning
 MAX_CAMERAS = 64
 Rows = tuple[tuple[float, ...], ...]
 FORMAT = "piccolo-camera/1"
-MAX_SIZE = 1 << 22  # [byte] of a file
+MAX_CALIBRATION_SIZE = 1 << 22  # [byte] of a file
 WANTED = f"wanted COLMAP's cameras.txt or .bin, OpenSfM's camera_models.json, {foreign.READ}: docs/CAMERAS.md"
 MARKUP = (".yaml", ".yml", ".xml")
 WANTED_RIG = "wanted COLMAP's rig_config.json, or the JSON of docs/CAMERAS.md with an image for each camera"
@@ -180,7 +180,7 @@ def read_calibration(path: Path) -> Calibration:
 
 def read_cameras(path: Path) -> Calibration:
     """Return the cameras in a file, told by its content; InputError if it holds none."""
-    text = "" if path.suffix.lower() == ".bin" else read_text(path, WANTED, MAX_SIZE)
+    text = "" if path.suffix.lower() == ".bin" else read_text(path, WANTED, MAX_CALIBRATION_SIZE)
     with naming(path, WANTED):
         if text.lstrip()[:1] in ("{", "["):
             return _of_document(path, json.loads(text))
@@ -201,7 +201,7 @@ def read_rig(path: Path) -> Calibration:
 
     COLMAP's file does not say how large a picture is: its cameras fit a picture of any size, as they are.
     """
-    text = read_text(path, WANTED_RIG, MAX_SIZE)
+    text = read_text(path, WANTED_RIG, MAX_CALIBRATION_SIZE)
     with naming(path, WANTED_RIG):
         document = json.loads(text)
         is_colmap = isinstance(document, list) and "image_prefix" in document[0]["cameras"][0]
@@ -309,9 +309,9 @@ def _of_opensfm(entry: Mapping[str, Any]) -> Camera:
 def read_colmap_cameras(path: Path) -> dict[str, Mount]:
     """Return the cameras of cameras.bin or .txt by id; lines of id, model, width, height, parameters."""
     if path.suffix.lower() == ".bin":
-        text = foreign.read_binary_cameras(read_bytes(path, WANTED, MAX_SIZE))
+        text = foreign.read_binary_cameras(read_bytes(path, WANTED, MAX_CALIBRATION_SIZE))
     else:
-        text = read_text(path, WANTED, MAX_SIZE)
+        text = read_text(path, WANTED, MAX_CALIBRATION_SIZE)
     mounts: dict[str, Mount] = {}
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split("#")[0].split()

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..cloud.readers.text_columns import is_number
 from ..errors import import_optional
-from ..files.json_file import MAX_SIZE, read_bytes, read_text
+from ..files.json_file import MAX_JSON_SIZE, read_bytes, read_text
 from .model import CUT_SPHERE, MODELS, Camera
 
 READ = "JSON of nerfstudio, Polycam or Record3D, YAML of OpenCV, ROS or Kalibr, XML of OpenCV or Metashape"
@@ -25,7 +25,7 @@ MODEL_NUMBERS = dict(
 )
 NUM_COLMAP = 10  # columns: id, qw, qx, qy, qz, tx, ty, tz, camera, name
 POINT_SIZE = 24  # [byte] of a point in images.bin
-MAX_NAME = 4096  # [byte]
+MAX_NAME_SIZE = 4096  # [byte]
 MATRIX = ("camera_matrix", "cameramatrix", "intrinsic_matrix", "intrinsics", "k")
 COEFFICIENTS = ("distortion_coefficients", "distortion_coeffs", "dist_coeffs", "distcoeffs", "d")
 WIDTHS = ("image_width", "width", "w")
@@ -35,7 +35,7 @@ LENS = ("distortion_model", "camera_model", "fisheye_model")
 FISHEYES = ("equidistant", "fisheye", "opencv_fisheye", "kannalabrandt4", "kannala_brandt")
 CORNER = 0.5  # [px] to a picture's corner from the middle of its first pixel, the origin of OpenCV and ROS
 SAME_FOCAL = 0.02  # of frames of one camera that has an autofocus
-MAX_DEPTH = 8
+MAX_NESTING = 8
 
 
 def read_binary_cameras(content: bytes) -> str:
@@ -57,7 +57,7 @@ def read_binary_cameras(content: bytes) -> str:
 def read_images(path: Path, wanted: str) -> list[list[str]]:
     """Return the rows of COLMAP's images.bin or .txt: number, pose, camera, name; ValueError if damaged."""
     if path.suffix == ".bin":
-        return list(_read_binary_images(read_bytes(path, wanted, MAX_SIZE)))
+        return list(_read_binary_images(read_bytes(path, wanted, MAX_JSON_SIZE)))
     lines = [line.strip() for line in read_text(path, wanted).splitlines()]
     rows = [line.split(None, NUM_COLMAP - 1) for line in lines if not line.startswith("#")]
     return [row for row in rows if not all(map(is_number, " ".join(row).split()))]  # else points
@@ -68,7 +68,7 @@ def _read_binary_images(content: bytes) -> Iterator[list[str]]:
     at = 8
     for _ in range(min(count, len(content))):
         image, *pose, camera = _unpack("<I7dI", content, at)
-        end = content.find(b"\0", at + 64, at + 64 + MAX_NAME)
+        end = content.find(b"\0", at + 64, at + 64 + MAX_NAME_SIZE)
         if end < 0:
             raise ValueError("a photo without a name")
         (num_points,) = _unpack("<Q", content, end + 1)
@@ -119,7 +119,7 @@ def _of_element(element: ElementTree.Element) -> Any:
 
 def cameras_in(document: Any) -> list[Camera]:
     """Return the cameras that a document describes, wherever it does; frames of one camera count once."""
-    cameras = list(dict.fromkeys(_search(document, MAX_DEPTH)))
+    cameras = list(dict.fromkeys(_search(document, MAX_NESTING)))
     if len(cameras) > 1 and len({(c.width, c.height, c.model) for c in cameras}) == 1:
         focals = np.array([camera.focal[0] for camera in cameras])
         if np.ptp(focals) <= SAME_FOCAL * focals.mean():

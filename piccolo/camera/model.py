@@ -63,7 +63,7 @@ FOCALS = "f", "fx", "fy"
 RADIAL = "k1"
 MAX_PERSPECTIVE = math.radians(89.9)  # half angle: no plane shows more
 MAX_ASPECT_ERROR = 0.01  # of a calibration of another size
-MAX_NUMBER = 1e6
+MAX_CAMERA_NUMBER = 1e6
 MIN_FOCAL = 1.0  # [px]
 TABLE_SIZE = 4096  # angles at which the radial part is tabulated, for Newton's first guess
 SMALL = 1e-4  # [rad] from the axis, at which the resolution is taken
@@ -186,10 +186,10 @@ class Camera:
         if self.model not in MODELS:
             raise InputError(f"found the camera model {self.model!r}, wanted one of {', '.join(MODELS)}")
         names = MODELS[self.model][1]
-        if len(self.params) != len(names) or not all(abs(p) <= MAX_NUMBER for p in self.params):
+        if len(self.params) != len(names) or not all(abs(p) <= MAX_CAMERA_NUMBER for p in self.params):
             wanted = f"wanted {len(names)} finite numbers ({' '.join(names)})"
             raise InputError(f"found {list(self.params)} as parameters of {self.model}, {wanted}")
-        if not (0 < self.width <= MAX_NUMBER and 0 < self.height <= MAX_NUMBER):
+        if not (0 < self.width <= MAX_CAMERA_NUMBER and 0 < self.height <= MAX_CAMERA_NUMBER):
             raise InputError(f"found a camera of {self.width} x {self.height}, wanted its size in pixels")
         if min(self.focal) < MIN_FOCAL:
             raise InputError(f"found a focal length of {min(self.focal):g} px, wanted at least {MIN_FOCAL:g}")

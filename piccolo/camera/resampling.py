@@ -16,15 +16,17 @@ from ..geometry.sphere import compute_rays
 from .calibration import Mount
 from .model import PARTIAL_SPHERE, SPHERE
 
-MAX_SPHERE_WIDTH = 4096  # [px] nothing looks at more
+MAX_RESAMPLED_WIDTH = 4096  # [px] nothing looks at more
 MIN_SPHERE_WIDTH = 256  # [px]
 ROWS = 64  # of the sphere, resampled at a time; divides its size
 COLUMNS = 128  # as well
-CELL = 4  # [px] within a block in the picture, places are found so far apart and linear between: to 0.05 px
+BLOCK_CELL = (
+    4  # [px] within a block in the picture, places are found so far apart and linear between: to 0.05 px
+)
 LOOK = 8  # [px] every so many it is seen first which blocks a camera shows
-MAX_SAMPLES = 8  # a pixel, across and down
+MAX_SAMPLES_A_PIXEL = 8  # a pixel, across and down
 AS_FINE = 0.8  # a picture is not made smaller by a factor nearer to 1: that would blur it
-MAX_SIDE = 32_000  # [px] of what cv2.remap reads
+MAX_REMAP_SIDE = 32_000  # [px] of what cv2.remap reads
 
 Pixels = tuple[Bytes, Mask]  # rgb (H, W, 3), is_valid (H, W)
 
@@ -40,7 +42,7 @@ def sphere_width(mounts: Sequence[Mount]) -> int:
     """Width [px] of the sphere that keeps the cameras' resolution at their axes, bounded."""
     finest = max(mount.camera.resolution for mount in mounts) * 2.0 * math.pi
     width = MIN_SPHERE_WIDTH * math.ceil(finest / MIN_SPHERE_WIDTH - 1e-6)
-    return min(max(width, MIN_SPHERE_WIDTH), MAX_SPHERE_WIDTH)
+    return min(max(width, MIN_SPHERE_WIDTH), MAX_RESAMPLED_WIDTH)
 
 
 def make_sphere(views: Sequence[View], width: int) -> Pixels:
@@ -66,13 +68,13 @@ def make_sphere(views: Sequence[View], width: int) -> Pixels:
     return rgb, nearest > -2.0
 
 
-def shrunk(view: View, width: int = MAX_SPHERE_WIDTH) -> View:
+def shrunk(view: View, width: int = MAX_RESAMPLED_WIDTH) -> View:
     """Return the same area-averaged, if it is clearly finer at the axis than a sphere, or too large."""
     camera = view.mount.camera
-    largest = MAX_SIDE / max(camera.width, camera.height)
+    largest = MAX_REMAP_SIDE / max(camera.width, camera.height)
     factor = min(1.0, width / (2.0 * math.pi * camera.resolution), largest)
     size = max(1, round(factor * camera.width)), max(1, round(factor * camera.height))
-    if size[0] >= AS_FINE * view.pixels.shape[1] and max(view.pixels.shape) <= MAX_SIDE:
+    if size[0] >= AS_FINE * view.pixels.shape[1] and max(view.pixels.shape) <= MAX_REMAP_SIDE:
         return view
     return view._replace(pixels=np.asarray(cv2.resize(view.pixels, size, interpolation=cv2.INTER_AREA)))
 
@@ -92,13 +94,13 @@ def _blocks(view: View, width: int) -> list[tuple[int, int]]:
 
 def _resample_block(view: View, width: int, top: int, left: int) -> Pixels:
     """Colours and validity of a block of the sphere's pixels."""
-    u = left + np.arange(0.0, COLUMNS + 1, CELL)
-    v = top + np.arange(0.0, ROWS + 1, CELL)
+    u = left + np.arange(0.0, COLUMNS + 1, BLOCK_CELL)
+    v = top + np.arange(0.0, ROWS + 1, BLOCK_CELL)
     places, is_in = _places(view, width, u, v)
     num = _num_samples(places, is_in)
     if is_in.all() and view.mount.camera.lens not in (SPHERE, PARTIAL_SPHERE):  # their seams are no place
         places = _interpolate_between(
-            _interpolate_between(places, num * CELL).swapaxes(0, 1), num * CELL
+            _interpolate_between(places, num * BLOCK_CELL).swapaxes(0, 1), num * BLOCK_CELL
         ).swapaxes(0, 1)
     else:
         u, v = (b + (np.arange(num * size) + 0.5) / num for b, size in ((left, COLUMNS), (top, ROWS)))
@@ -130,5 +132,5 @@ def _num_samples(places: Array, is_in: Mask) -> int:
     """Return the number of samples a pixel needs in each direction, for the largest step between cells."""
     across = np.linalg.norm(np.diff(places, axis=1), axis=2)[is_in[:, 1:] & is_in[:, :-1]]
     down = np.linalg.norm(np.diff(places, axis=0), axis=2)[is_in[1:] & is_in[:-1]]
-    largest = max(across.max(initial=1.0), down.max(initial=1.0)) / CELL
-    return int(min(max(math.ceil(largest - 0.5), 1), MAX_SAMPLES))
+    largest = max(across.max(initial=1.0), down.max(initial=1.0)) / BLOCK_CELL
+    return int(min(max(math.ceil(largest - 0.5), 1), MAX_SAMPLES_A_PIXEL))

@@ -192,7 +192,7 @@ def make_coloring_job(arguments: Arguments, photos: Sequence[Path], localizer: L
         for result in results:
             own = [warning for warning in result.warnings if warning not in of_scan]
             print_result(arguments, result, own)
-        least = color_scan.LEAST_PHOTOS
+        least = color_scan.LEAST_COLORING_PHOTOS
         if sum(result.status == LOCALIZED for result in results) < least:
             return f"; {arguments.color_scan} is not written: wanted {least} localized photos or more", False
         colored = color_scan.write_colored_scan(

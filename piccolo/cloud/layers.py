@@ -14,7 +14,7 @@ from ..arrays import Array, Int8s, Int64s
 from ..geometry.robust import weigh_absolute
 from ..jobs.threads import Workers, one_blas_thread
 from .octree import Octree
-from .profiles import BIN, NUM_BINS, Profiles, measure_profiles
+from .profiles import BIN, NUM_PROFILE_BINS, Profiles, measure_profiles
 
 NUM_PATCHES = 3000
 NUM_SAMPLED = 100  # of these, by which their radius is chosen
@@ -24,8 +24,8 @@ CELL_LEVELS = 2  # above the leaves: patches begin in cells of 8 cm
 LEAST_LEAVES = 25  # of a sheet
 LEAST_QUARTER = 3  # of these, in each quarter of the patch
 LEAST_MAIN = 0.3  # of all leaves of a profile, in its sheet: else it is noise
-EDGE = 0.25  # of the sheet's peak: a second one begins beyond where the profile falls below
-LEAST_SHARED = 0.35  # part of the sheet that a second one is over, too
+PEAK_EDGE = 0.25  # of the sheet's peak: a second one begins beyond where the profile falls below
+LEAST_SHARED_SHEET = 0.35  # part of the sheet that a second one is over, too
 DIP = 0.5  # of the second peak, between both
 NOT_TOLD = 2  # bins beyond the edge, where a second sheet may merge with the first
 LARGEST_GAP = 0.07  # [m] walls between rooms are thicker
@@ -33,12 +33,12 @@ MOST_TURN = np.radians(2.0)
 MOST_MOVE = 0.3  # [m] in the middle of the scan
 NUM_DRAWS = 3000
 SINGLE_SHARE = 0.3  # of the draws' patches beyond the first are taken for single
-LEAST_SPREAD = 0.5  # [m] determinant of three walls, by which a turn and a move differ
-NUM_SCORED = 300  # patches, by which draws are compared
+LEAST_WALL_SPREAD = 0.5  # [m] determinant of three walls, by which a turn and a move differ
+NUM_SCORED_PATCHES = 300  # patches, by which draws are compared
 NUM_BEST = 10  # motions of walls that are refined
 IS_WALL = 0.5  # most of a normal's vertical part
-TELLING = 0.0125  # [m] gaps below this are not seen
-CHANCE = 0.12  # charged for each patch that tells, double or not: some are double by chance
+SEEN_GAP = 0.0125  # [m] gaps below this are not seen
+PATCH_CHARGE = 0.12  # charged for each patch that tells, double or not: some are double by chance
 # Of trials with single scans (rooms, buildings, noise of 0.5 to 4 cm, thinned) and with 1 of 2 to 6 stations
 # moved by 3 and 5 cm; between them is a real scan that drifted (0.23 and 0.026)
 LEAST_SHARE = 0.25  # double patches of those that tell; with a moved station 0.22 to 0.96
@@ -47,9 +47,9 @@ LEAST_PART = 0.03  # double patches of all; in single scans up to 0.021, with a 
 SAME_GAP = 0.15  # relative range of gaps that are the thickness of things
 BEYOND = 0.03  # charged for a patch whose gap would be too large to tell
 TOLERANCES = (3, 2, 2, 2, 2)  # bins between expected and found gaps, by iteration
-LEAST_RESIDUAL = 0.003  # [m] of gaps that fit
-RIDGE = np.array([0.1, 0.1, 1e-3, 1e-4, 1e-4, 1e-4])  # of the weights' sum: hardly any scan is tilted
-HEIGHTS = np.arange(0.0, 0.12, BIN / 2.0)  # [m] tried
+LEAST_GAP_RESIDUAL = 0.003  # [m] of gaps that fit
+MOTION_RIDGE = np.array([0.1, 0.1, 1e-3, 1e-4, 1e-4, 1e-4])  # of the weights' sum: hardly any scan is tilted
+TRIED_HEIGHTS = np.arange(0.0, 0.12, BIN / 2.0)  # [m] tried
 NO_LAYERS = np.zeros((3, 3))  # motion of a scan that has one layer
 
 
@@ -67,7 +67,9 @@ class Patches(NamedTuple):
 
     by_motion: Array  # (N, 6) derivative of the gap by a motion: turn, move
     is_wall: Int64s  # (W,) indices of the upright ones
-    is_double: Int8s  # (N, NUM_BINS) by gap: 1 with a second sheet, 0 without, -1 if that can't be told
+    is_double: (
+        Int8s  # (N, NUM_PROFILE_BINS) by gap: 1 with a second sheet, 0 without, -1 if that can't be told
+    )
     patch: Int64s  # (P,) of each second sheet
     gap: Array  # (P,) [m] its distance
 
@@ -107,7 +109,7 @@ def find_layers(octree: Octree, workers: Workers) -> Layers | None:
     motion = find_motion(patches)
     gaps = np.abs(patches.by_motion @ motion)
     votes = vote(patches, patches.by_motion, motion[None])[:, 0]
-    tells = (votes >= 0) & (gaps > TELLING)
+    tells = (votes >= 0) & (gaps > SEEN_GAP)
     double = np.flatnonzero(tells & (votes == 1))
     share = len(double) / max(int(np.count_nonzero(tells)), 1)
     if len(double) < least or share < LEAST_SHARE:
@@ -128,7 +130,7 @@ def measure_sheets(octree: Octree, workers: Workers) -> Profiles:
     median = np.median(sample.counts.sum(axis=(1, 2))) if len(sample.counts) else 0.0
     profiles = measure_profiles(octree, leaves, RADII[int(median < THICK)], workers)
     total = profiles.counts.sum(axis=(1, 2))
-    main = profiles.counts[:, :, NUM_BINS - 2 : NUM_BINS + 3].sum(axis=2)
+    main = profiles.counts[:, :, NUM_PROFILE_BINS - 2 : NUM_PROFILE_BINS + 3].sum(axis=2)
     least = np.maximum(LEAST_LEAVES, LEAST_MAIN * total)
     is_full = (main.sum(axis=1) >= least) & (main.min(axis=1) >= LEAST_QUARTER)
     return Profiles(*(values[is_full] for values in profiles))
@@ -149,15 +151,15 @@ def see_second_sheets(profiles: Profiles, middle: Array) -> Patches:
     """Find second sheets in profiles; the motion is that of the middle (3,) of the scan."""
     counts = profiles.counts.astype(np.float64)
     counts[..., 1:-1] += profiles.counts[..., :-2] + profiles.counts[..., 2:]
-    shared = np.zeros((len(counts), NUM_BINS))
+    shared = np.zeros((len(counts), NUM_PROFILE_BINS))
     is_told = np.ones(shared.shape, np.bool_)
-    for over in (counts[..., NUM_BINS:-1], counts[..., NUM_BINS:0:-1]):
+    for over in (counts[..., NUM_PROFILE_BINS:-1], counts[..., NUM_PROFILE_BINS:0:-1]):
         first = over[..., :1]
         total = np.maximum(first.sum(axis=1), 1.0)
         both = np.minimum(over, first).sum(axis=1) / total
         least = np.minimum.accumulate(over.sum(axis=1) / total, axis=1)
-        is_beyond = least < EDGE
-        is_second = is_beyond & (both > LEAST_SHARED) & (least < DIP * both)
+        is_beyond = least < PEAK_EDGE
+        is_second = is_beyond & (both > LEAST_SHARED_SHEET) & (least < DIP * both)
         shared = np.maximum(shared, np.where(is_second, both, 0.0))
         is_told[:, NOT_TOLD:] &= is_beyond[:, :-NOT_TOLD]
         is_told[:, :NOT_TOLD] = False
@@ -185,7 +187,7 @@ def find_peaks(values: Array) -> tuple[Int64s, Int64s, Array]:
 def vote(patches: Patches, by_motion: Array, motions: Array, some: Int64s | slice = slice(None)) -> Int8s:
     """Return (S, M), as `is_double`, what some patches say to motions (M, K); -2 of too large gaps."""
     gaps = np.abs(by_motion[some] @ motions.T)
-    bins = np.minimum((gaps / BIN + 0.5).astype(np.int64), NUM_BINS - 1)
+    bins = np.minimum((gaps / BIN + 0.5).astype(np.int64), NUM_PROFILE_BINS - 1)
     double = np.take_along_axis(patches.is_double[some], bins, axis=1)
     return np.where(gaps > LARGEST_GAP, -2, double).astype(np.int8)
 
@@ -193,7 +195,7 @@ def vote(patches: Patches, by_motion: Array, motions: Array, some: Int64s | slic
 def score(patches: Patches, by_motion: Array, motions: Array, some: Int64s | slice = slice(None)) -> Array:
     """Return scores (M,) of motions (M, K): double patches less those that there are by chance."""
     votes = vote(patches, by_motion, motions, some)
-    charged = np.where(votes == -2, BEYOND, np.where(votes >= 0, CHANCE, 0.0))
+    charged = np.where(votes == -2, BEYOND, np.where(votes >= 0, PATCH_CHARGE, 0.0))
     return np.asarray(((votes == 1) - charged).sum(axis=0) / max(len(votes), 1))
 
 
@@ -204,14 +206,14 @@ def find_motion(patches: Patches) -> Array:
     by_wall = patches.by_motion[:, 2:5]
     drawn = draw_motions(patches, by_wall, rng)
     some = patches.is_wall
-    some = rng.choice(some, min(len(some), NUM_SCORED), replace=False)
+    some = rng.choice(some, min(len(some), NUM_SCORED_PATCHES), replace=False)
     best = drawn[np.argsort(-score(patches, by_wall, drawn, some), kind="stable")[:NUM_BEST]]
-    some = rng.choice(level, min(len(level), NUM_SCORED), replace=False)
+    some = rng.choice(level, min(len(level), NUM_SCORED_PATCHES), replace=False)
     ends = []
     for three in best:
-        motions = np.zeros((len(HEIGHTS), 6))
+        motions = np.zeros((len(TRIED_HEIGHTS), 6))
         motions[:, 2:5] = three
-        motions[:, 5] = HEIGHTS
+        motions[:, 5] = TRIED_HEIGHTS
         of_level = score(patches, patches.by_motion, motions, some) if len(some) else np.zeros(1)
         ends.append(refine(patches, motions[of_level.argmax()]))
     return ends[int(score(patches, patches.by_motion, np.array(ends)).argmax())]
@@ -227,7 +229,7 @@ def draw_motions(patches: Patches, by_wall: Array, rng: np.random.Generator) -> 
     is_single = (rng.random(drawn.shape) < SINGLE_SHARE) & (np.arange(3) > 0)
     rows = np.where(is_single, rng.choice(patches.is_wall, drawn.shape), patches.patch[drawn])
     gaps = np.where(is_single, 0.0, patches.gap[drawn])
-    is_spread = np.abs(np.linalg.det(by_wall[rows])) > LEAST_SPREAD
+    is_spread = np.abs(np.linalg.det(by_wall[rows])) > LEAST_WALL_SPREAD
     signs = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, -1.0], [1.0, -1.0, 1.0], [1.0, -1.0, -1.0]])
     signed = gaps[is_spread][:, None] * signs
     found = np.linalg.solve(by_wall[rows[is_spread]][:, None], signed[..., None]).reshape(-1, 3)
@@ -245,8 +247,8 @@ def refine(patches: Patches, motion: Array) -> Array:
         is_near = np.abs(patches.gap - np.abs(expected)) <= tolerance * BIN
         rows = by_motion[is_near]
         gaps = np.where(expected < 0.0, -patches.gap, patches.gap)[is_near]
-        weights = weigh_absolute(gaps - expected[is_near], LEAST_RESIDUAL)
-        normal_matrix = (rows * weights[:, None]).T @ rows + np.diag(RIDGE * (weights.sum() + 1.0))
+        weights = weigh_absolute(gaps - expected[is_near], LEAST_GAP_RESIDUAL)
+        normal_matrix = (rows * weights[:, None]).T @ rows + np.diag(MOTION_RIDGE * (weights.sum() + 1.0))
         moved = np.asarray(np.linalg.solve(normal_matrix, rows.T @ (weights * gaps)))
         found = score(patches, patches.by_motion, moved[None])[0]
         if found >= best:

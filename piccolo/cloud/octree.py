@@ -10,7 +10,7 @@ from ..geometry.cone import Cone, is_apart
 from ..geometry.vectors import Triple
 from ..jobs.memory import check_memory
 from ..kernels.jit import F0, Scalar, inline_kernel, kernel
-from .voxels import AT_ONCE, LEAF_SIZE, NUM_LEVELS, THIN, Voxels
+from .voxels import LEAF_SIZE, NUM_LEVELS, THIN, VOXELS_AT_ONCE, Voxels
 
 NODE_BYTES = 6 * 4 + 4  # mean, first child
 LEVEL_BYTES = 8 + 1 + 8 + 4 + 8  # codes, which begin a parent, first children, twice, codes of these
@@ -67,9 +67,9 @@ def build_octree(voxels: Voxels) -> Octree:
 
 def average(children: Array32, first: Int32s, parents: Array32) -> None:
     """Write the means (M, 6) of the children (N, 6) that begin at `first` (M,)."""
-    for begin in range(0, len(first), AT_ONCE):
-        part = slice(begin, begin + AT_ONCE)
-        last = first[begin + AT_ONCE] if begin + AT_ONCE < len(first) else len(children)
+    for begin in range(0, len(first), VOXELS_AT_ONCE):
+        part = slice(begin, begin + VOXELS_AT_ONCE)
+        last = first[begin + VOXELS_AT_ONCE] if begin + VOXELS_AT_ONCE < len(first) else len(children)
         own = children[first[begin] : last]
         places = first[part] - first[begin]
         counts = np.diff(places, append=len(own))

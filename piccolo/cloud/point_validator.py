@@ -12,7 +12,7 @@ from .readers import reader
 
 MIN_POINTS = 1000
 MIN_BRIGHTEST = 2  # of 255; 16-bit fields that hold 8-bit values come out at 1
-COARSE = 0.01  # [m] steps between float32 numbers that are reported, from 131 km on
+COARSE_STEP = 0.01  # [m] steps between float32 numbers that are reported, from 131 km on
 Chunk = tuple[Array, Bytes]  # finite points (N, 3) [m], colours (N, 3)
 
 
@@ -86,7 +86,7 @@ class PointValidator:
         if self.is_colored and not self.is_varied and self.color is not None:
             color = " ".join(map(str, self.color.tolist()))
             found.append(f"all points have one colour ({color}), which shows nothing: wanted their colours")
-        if self.step >= COARSE:
+        if self.step >= COARSE_STEP:
             what = f"its float32 coordinates, far from the origin, are rounded to {self.step:.2g} m"
             found.append(f"{what}: export it in float64, or nearer to its origin")
         return tuple(f"{self.path}: {text}" for text in found)

@@ -12,16 +12,16 @@ from ..kernels.jit import Scalar, inline_kernel, kernel
 from .octree import DIAGONAL, Octree
 
 BIN = 0.005  # [m] of heights
-NUM_BINS = 19  # above a patch, and as many below
-REACH = (NUM_BINS + 0.5) * BIN  # [m]
+NUM_PROFILE_BINS = 19  # above a patch, and as many below
+PROFILE_REACH = (NUM_PROFILE_BINS + 0.5) * BIN  # [m]
 MOST_AROUND = 8192  # voxels around a place: thirty layers of 2 cm
-TOLERANCE = 0.0125  # [m] to the sheet by which a normal is found
+NORMAL_TOLERANCE = 0.0125  # [m] to the sheet by which a normal is found
 NUM_FITS = 2
 NUM_SQUARED = 6  # times, even, so that the greatest of three eigenvalues rules
 MIDDLE_BINS = 8  # BIN [m] to the sheet from the voxel that chose the patch
-TINY = 1e-150
-FEW = 10  # voxels in a sheet do not tell its normal
-AT_ONCE = 250  # patches of a task
+TINY_NORM = 1e-150
+FEW_VOXELS = 10  # voxels in a sheet do not tell its normal
+PATCHES_AT_ONCE = 250  # patches of a task
 
 
 class Profiles(NamedTuple):
@@ -29,7 +29,7 @@ class Profiles(NamedTuple):
 
     places: Array  # (N, 3) [m]
     normals: Array  # (N, 3) unit, of either sign
-    counts: Int32s  # (N, 4, 2 NUM_BINS + 1) voxels by quarter of the patch and by height, upwards
+    counts: Int32s  # (N, 4, 2 NUM_PROFILE_BINS + 1) voxels by quarter of the patch and by height, upwards
 
 
 @inline_kernel
@@ -82,7 +82,7 @@ def write_adjugate(matrix: Array, adjugate: Array) -> None:
 @inline_kernel
 def write_square(matrix: Array, square: Array) -> None:
     """Write the square of a symmetric matrix (3, 3), divided by its squared trace."""
-    scale = 1.0 / max(matrix[0, 0] + matrix[1, 1] + matrix[2, 2], TINY) ** 2
+    scale = 1.0 / max(matrix[0, 0] + matrix[1, 1] + matrix[2, 2], TINY_NORM) ** 2
     for i in range(3):
         for j in range(3):
             square[i, j] = scale * dot(matrix[i], matrix[j])
@@ -101,7 +101,7 @@ def find_normal(moments: Array) -> Triple:
     for k in range(1, 3):
         if A[k, k] > A[best, best]:
             best = k
-    length = max(math.sqrt(dot(A[best], A[best])), TINY)
+    length = max(math.sqrt(dot(A[best], A[best])), TINY_NORM)
     return A[best, 0] / length, A[best, 1] / length, A[best, 2] / length
 
 
@@ -155,16 +155,16 @@ def find_moments(
 def count_heights(
     offsets: Array, count: int, normal: Triple, sheet: Scalar, radius: float, counts: Int32s
 ) -> None:
-    """Count offsets (N, 3) in the quarters of a disc by their heights over a sheet: (4, 2 NUM_BINS + 1)."""
+    """Count offsets (N, 3) in quarters of a disc by heights over a sheet: (4, 2 NUM_PROFILE_BINS + 1)."""
     is_upright = math.fabs(normal[2]) < 0.7
     u = (normal[1], -normal[0], 0.0) if is_upright else (0.0, normal[2], -normal[1])
     v = cross(normal, u)
     for i in range(count):
         height = dot(offsets[i], normal)
         across = dot(offsets[i], offsets[i]) - height * height
-        if math.fabs(height - sheet) < REACH and across < radius * radius:
+        if math.fabs(height - sheet) < PROFILE_REACH and across < radius * radius:
             quarter = int(dot(offsets[i], u) > 0.0) + 2 * int(dot(offsets[i], v) > 0.0)
-            counts[quarter, math.floor((height - sheet) / BIN + 0.5) + NUM_BINS] += 1
+            counts[quarter, math.floor((height - sheet) / BIN + 0.5) + NUM_PROFILE_BINS] += 1
 
 
 @kernel
@@ -175,22 +175,22 @@ def write_profiles(tree: Octree, radius: float, places: Array, normals: Array, c
     """
     offsets = np.empty((MOST_AROUND, 3))
     moments = np.empty((4, 3))
-    reach = math.sqrt(radius * radius + (REACH + MIDDLE_BINS * BIN) ** 2)
+    reach = math.sqrt(radius * radius + (PROFILE_REACH + MIDDLE_BINS * BIN) ** 2)
     for p in range(len(places)):
         count = find_around(tree, places[p], reach, offsets)
-        if find_moments(offsets, count, (0.0, 0.0, 0.0), radius, 0.0, reach, moments) < FEW:
+        if find_moments(offsets, count, (0.0, 0.0, 0.0), radius, 0.0, reach, moments) < FEW_VOXELS:
             continue
         normal = find_normal(moments)
         height: Scalar = 0.0
         num = 0
         for _ in range(NUM_FITS):
             sheet = find_sheet(offsets, count, normal, radius)
-            num = find_moments(offsets, count, normal, radius, sheet, TOLERANCE, moments)
-            if num < FEW:
+            num = find_moments(offsets, count, normal, radius, sheet, NORMAL_TOLERANCE, moments)
+            if num < FEW_VOXELS:
                 break
             normal = find_normal(moments)
             height = dot(moments[3], normal)
-        if num < FEW:
+        if num < FEW_VOXELS:
             continue
         count_heights(offsets, count, normal, height, radius, counts[p])
         for k in range(3):
@@ -202,12 +202,14 @@ def measure_profiles(tree: Octree, leaves: Int64s, radius: float, workers: Worke
     """Return the profiles of patches of a radius [m] around leaves (N,), without those that are no plane."""
     places = tree.nodes[leaves, :3].astype(np.float64)
     normals = np.zeros((len(leaves), 3))
-    counts = np.zeros((len(leaves), 4, 2 * NUM_BINS + 1), np.int32)
+    counts = np.zeros((len(leaves), 4, 2 * NUM_PROFILE_BINS + 1), np.int32)
 
     def write(begin: int) -> None:
-        some = slice(begin, begin + AT_ONCE)
+        some = slice(begin, begin + PATCHES_AT_ONCE)
         write_profiles(tree, radius, places[some], normals[some], counts[some])
 
-    Workers(workers.num_threads).map(write, range(0, len(leaves), AT_ONCE), "")  # too short to be shown
+    Workers(workers.num_threads).map(
+        write, range(0, len(leaves), PATCHES_AT_ONCE), ""
+    )  # too short to be shown
     is_plane = normals.any(axis=1)
     return Profiles(places[is_plane], normals[is_plane], counts[is_plane])

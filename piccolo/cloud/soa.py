@@ -9,7 +9,7 @@ from ..errors import InputError
 from ..geometry.colors import pack_rgbx
 from ..geometry.pose import Pose
 
-FARTHEST = 1e7  # [m] from the local origin; squares stay finite in float32 and the loss is inf beyond
+FARTHEST_POINT = 1e7  # [m] from the local origin; squares stay finite in float32 and the loss is inf beyond
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,9 @@ class MapFrame:
     def from_world(self, pose: Pose) -> Pose:
         """Transform a pose of the world to this frame; InputError if it is too far away for float32."""
         center_world = pose.center_world
-        if not np.abs(center_world - self.origin_world).max() < FARTHEST:
+        if not np.abs(center_world - self.origin_world).max() < FARTHEST_POINT:
             found = f"found a camera at {center_world.tolist()}"
-            raise InputError(f"{found}, wanted one within {FARTHEST:.0e} m of the cloud")
+            raise InputError(f"{found}, wanted one within {FARTHEST_POINT:.0e} m of the cloud")
         R = self.R_map_from_world
         return Pose(pose.R_cam_from_world @ R.T, R @ (center_world - self.origin_world))
 

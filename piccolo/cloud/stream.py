@@ -25,10 +25,9 @@ from .settings import BY_FILE, Channel, CloudSettings, UpAxis
 from .voxels import Voxels, VoxelTable, morton_order
 
 METRES_LIMIT = 2000.0  # [m], a scan wider than this along two axes is more likely in millimetres
-FAR = 16_384.0  # [m] from the origin, where float32 steps by 2 mm
-MAX_SAMPLES = 100_000  # points that the estimate of the extent looks at
+FAR_FROM_ORIGIN = 16_384.0  # [m] from the origin, where float32 steps by 2 mm
+MAX_EXTENT_SAMPLES = 100_000  # points that the estimate of the extent looks at
 
-MAX_CRS_LENGTH = 20_000  # characters of a coordinate system's description; a longer one is ignored
 ALONE = Workers()
 ARRAYS = Path("arrays")  # the name of a scan that is no file, in messages and results
 
@@ -43,13 +42,13 @@ def unit_warnings(label: str, points: Array32) -> tuple[str, ...]:
 
     It looks like millimetres if 98 % of the points span more than 2,000 along at least two axes.
     """
-    samples = points[:: 1 + len(points) // MAX_SAMPLES]
+    samples = points[:: 1 + len(points) // MAX_EXTENT_SAMPLES]
     low, high = np.percentile(samples, [1.0, 99.0], axis=0)
     if np.count_nonzero(high - low > METRES_LIMIT) >= 2:
         size = " x ".join(f"{extent:.0f}" for extent in high - low)
         return (f"{label}: the cloud spans {size} m; if its unit is the millimetre, set `units` to mm",)
     farthest = float(np.abs(points).max())
-    if farthest > FAR:
+    if farthest > FAR_FROM_ORIGIN:
         limit = f"limit the precision of the rest to {np.spacing(np.float32(farthest)):.2g} m"
         return (f"{label}: points {2 * farthest:.0f} m apart {limit}; remove the outliers",)
     return ()
@@ -115,7 +114,9 @@ class CloudStream:
             validator = PointValidator(
                 source.path, np.array(source.units), source.channel == "colors", box=self.box
             )
-            total = None if source.num_points is None else math.ceil(source.num_points / reader.CHUNK)
+            total = (
+                None if source.num_points is None else math.ceil(source.num_points / reader.POINTS_A_CHUNK)
+            )
             try:
                 for raw in self.show(source.read_chunks(), total, f"read {source.path.name}"):
                     check_address_space()
@@ -333,4 +334,4 @@ def read_crs(paths: Sequence[Path]) -> str:
         text = las_file.read_crs(paths[0])
     elif head.startswith(e57_file.MAGIC):
         text = e57_file.read_xml(paths[0]).findtext("coordinateMetadata", "")
-    return " ".join(text.split()) if len(text) <= MAX_CRS_LENGTH else ""
+    return " ".join(text.split()) if len(text) <= reader.MAX_CRS_LENGTH else ""

@@ -21,10 +21,10 @@ from ..geometry.robust import weigh_absolute
 from ..jobs.threads import Workers
 from .octree import Octree, recolor
 
-AT_ONCE = 20_000  # voxels of a task
+CELLS_AT_ONCE = 20_000  # voxels of a task
 FULL_CREASE = 0.6  # root of the second eigenvalue; 0.7 for two planes at a right angle
 BORDER = 0.08, 0.28  # distance of the surroundings' middle, divided by the radius: nothing, and a full border
-VERTICAL = 0.8, 0.95  # cosine of an edge's angle to the vertical: not vertical at all, and fully
+COS_UPRIGHT = 0.8, 0.95  # cosine of an edge's angle to the vertical: not vertical at all, and fully
 VERTICAL_BORDER = 0.9, 0.98
 CELLS = (3, 4)  # levels above the leaves: cells of 16 cm, or 32 cm where the scan is thin
 MIN_LEAVES = 20
@@ -34,12 +34,12 @@ SOME_CELLS = 1000  # at a time
 NOISE_SHARE = 0.3  # of the noise's deviation that is left in a pose, from trials with noise of 1 to 5 cm
 ONE_SHEET = 2.5  # kurtosis of noise within a cell, about; of two thin sheets it is 1
 ROUGHNESS = 0.005  # [m] of clean surfaces and the things on them
-FLAT = 0.03  # least ratio of the two smaller variances of a cell that is not flat
+LEAST_UNEVEN = 0.03  # least ratio of the two smaller variances of a cell that is not flat
 SURFACE = 1.28  # [m] chosen: size of surfaces, which are displaced against each other
 UNKNOWN_DISPLACEMENT = 0.01  # [m] chosen
 NUM_ITERATIONS = 20
-LEAST_RESIDUAL = 1e-5  # [m^2] of cells that fit, all alike
-RIDGE = 3e-3  # on the squared norm of the tensor: two walls at a right angle leave a part undetermined
+LEAST_RESIDUAL_SQUARED = 1e-5  # [m^2] of cells that fit, all alike
+NORM_RIDGE = 3e-3  # on the squared norm of the tensor: two walls at a right angle leave a part undetermined
 
 
 class Surroundings(NamedTuple):
@@ -51,7 +51,7 @@ class Surroundings(NamedTuple):
     num_edge: int
 
 
-WIDE = Surroundings(0.12, 24, 0.15, 48)  # of voxels of 4 cm
+WIDE_SURROUNDINGS = Surroundings(0.12, 24, 0.15, 48)  # of voxels of 4 cm
 NARROW = Surroundings(0.06, 12, 0.06, 16)  # of the leaves, of 2 cm
 
 
@@ -62,7 +62,7 @@ def paint_shape(octree: Octree, workers: Workers) -> Octree:
     """
     start = octree.level_start
     begin, end = int(start[-3]), int(start[-2])
-    colors = color_edges(octree.nodes[begin:end], WIDE, workers)
+    colors = color_edges(octree.nodes[begin:end], WIDE_SURROUNDINGS, workers)
     counts = np.diff(octree.first_child[begin : end + 1])
     painted = recolor(octree, np.repeat(colors, counts, axis=0), np.ones(len(octree.nodes) - end, np.float32))
     painted.nodes[end:, 3:] = color_edges(octree.nodes[end:], NARROW, workers)
@@ -80,7 +80,7 @@ def find_edges(points: Array, around: Surroundings, workers: Workers) -> Array:
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 
     tree = cKDTree(points)
-    parts = [slice(lo, lo + AT_ONCE) for lo in range(0, len(points), AT_ONCE)]
+    parts = [slice(lo, lo + CELLS_AT_ONCE) for lo in range(0, len(points), CELLS_AT_ONCE)]
     normals = np.concatenate(
         workers.map(lambda part: find_normals(points, tree, around, part), parts, "find surfaces") or [points]
     )
@@ -120,7 +120,7 @@ def edges_of(points: Array, tree: Any, normals: Array, around: Surroundings, par
     distance = np.linalg.norm(middle, axis=1)
     border = rise(distance / around.edge_radius, BORDER)
     along_border = np.abs(np.cross(middle, normal)[:, 2]) / np.maximum(distance, 1e-9)
-    vertical = np.maximum(crease * rise(along, VERTICAL), border * rise(along_border, VERTICAL_BORDER))
+    vertical = np.maximum(crease * rise(along, COS_UPRIGHT), border * rise(along_border, VERTICAL_BORDER))
     return np.stack([np.maximum(crease, border), vertical], axis=1)
 
 
@@ -212,7 +212,7 @@ def displacement(octree: Octree) -> float:
     variances = []
     for levels_up in CELLS:
         found = [planes.variances for planes in fit_planes(octree, levels_up)]
-        across = [v[v[:, 0] < FLAT * v[:, 1], 0] for v in found]
+        across = [v[v[:, 0] < LEAST_UNEVEN * v[:, 1], 0] for v in found]
         if sum(map(len, across)) < MIN_CELLS:
             return UNKNOWN_DISPLACEMENT
         variances.append(float(np.median(np.concatenate(across))))
@@ -229,9 +229,9 @@ def fit_tensor(normals: Array, variances: Array) -> Array:
     tensor = np.zeros((3, 3))
     for _ in range(NUM_ITERATIONS):  # reweighted least squares
         weighted = design * weights[:, None]
-        normal_matrix = design.T @ weighted + RIDGE * weights.sum() * np.diag(twice)
+        normal_matrix = design.T @ weighted + NORM_RIDGE * weights.sum() * np.diag(twice)
         found = np.linalg.solve(normal_matrix, weighted.T @ variances)
-        weights = weigh_absolute(design @ found - variances, LEAST_RESIDUAL)
+        weights = weigh_absolute(design @ found - variances, LEAST_RESIDUAL_SQUARED)
     tensor[rows, columns] = tensor[columns, rows] = found
     values, axes = np.linalg.eigh(tensor)
     return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)

@@ -21,7 +21,9 @@ OTHERS = ("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS", "GEOCCS")  # neither projected
 GEOGRAPHIC = ("GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS")
 VERTICAL = ("VERT_CS", "VERTCS", "VERTCRS", "VERTICALCRS")
 LENGTHS = ("UNIT", "LENGTHUNIT")
-ROUNDING = 2e-7  # of a unit that is written with few digits; feet and US survey feet differ by ten times that
+UNIT_ROUNDING = (
+    2e-7  # of a unit that is written with few digits; feet and US survey feet differ by ten times that
+)
 UNIT_CODES = {9001: 1.0, 9002: METRES["ft"], 9003: METRES["us-ft"], 9036: 1000.0, 1033: 0.01, 1025: 0.001}
 USER_DEFINED = 32767
 MODEL_KEY = 1024
@@ -125,7 +127,7 @@ def snap_length(metres: float) -> float:
     """Return the unit that a length [m] is up to rounding, or the length itself; ValueError if it is none."""
     if not (math.isfinite(metres) and metres > 0.0):
         raise ValueError(f"found a unit of {metres} m")
-    return next((known for known in NAMES if abs(metres / known - 1.0) < ROUNDING), metres)
+    return next((known for known in NAMES if abs(metres / known - 1.0) < UNIT_ROUNDING), metres)
 
 
 def read_geo_keys(keys: bytes) -> dict[int, tuple[int, int]]:

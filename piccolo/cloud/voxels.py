@@ -25,7 +25,7 @@ COARSEST = 128  # leaves along a voxel of the coarsest level
 PHASE = (COARSEST << QUANTUM_BITS) // 3 + 1
 
 JOINING_BYTES = 160  # a voxel, of which two clouds' are joined: nodes, cells, codes, order, sums
-AT_ONCE = 1 << 18  # voxels, whose temporary arrays stay small
+VOXELS_AT_ONCE = 1 << 18  # voxels, whose temporary arrays stay small
 THIN = "set `units` if its unit is not the metre, or cut out a part"
 NUM_LEVELS = COARSEST.bit_length()  # from 128 leaves wide (2.56 m) down to one
 
@@ -34,8 +34,8 @@ MAX_COUNT = 1 << 23  # points of a voxel that are summed, at most: int32 holds n
 MAX_CELL = 1 << 31  # cells from the first point to any other, below this: 43,000 km
 
 # columns of a voxel's row: cell, number of points, sums of quanta, sums of colours
-CELL = 0
-COUNT = 3
+CELL_COLUMN = 0
+COUNT_COLUMN = 3
 POSITION = 4
 COLOR = 7
 NUM_COLUMNS = 10
@@ -140,7 +140,7 @@ def find_slot(index: Int32s, rows: Int32s, slot: np.int64, x: np.int64, y: np.in
     """Return the slot that holds a cell's row, or else the free slot where it belongs."""
     while index[slot] != 0:
         row = rows[index[slot] - 1]
-        if row[CELL] == x and row[CELL + 1] == y and row[CELL + 2] == z:
+        if row[CELL_COLUMN] == x and row[CELL_COLUMN + 1] == y and row[CELL_COLUMN + 2] == z:
             break
         slot = (slot + 1) & (len(index) - 1)
     return slot
@@ -170,7 +170,7 @@ def look_up(
     for i in range(len(points)):
         found[i] = index[slots[i]]
     for i in range(len(points)):
-        found[i] = rows[max(found[i], 1) - 1, COUNT]
+        found[i] = rows[max(found[i], 1) - 1, COUNT_COLUMN]
 
 
 @inline_kernel
@@ -186,9 +186,9 @@ def enter_cells(
         if index[slot] == 0:
             row = rows[num_voxels]
             row[:] = 0
-            row[CELL] = x
-            row[CELL + 1] = y
-            row[CELL + 2] = z
+            row[CELL_COLUMN] = x
+            row[CELL_COLUMN + 1] = y
+            row[CELL_COLUMN + 2] = z
             num_voxels += 1
             index[slot] = num_voxels
         found[i] = index[slot] - 1
@@ -214,8 +214,8 @@ def add_points(
         count, num_voxels = enter_cells(quanta, slots, index, rows, num_voxels, found[:num])
         for i in range(count):
             row = rows[found[i]]
-            if row[COUNT] < MAX_COUNT:
-                row[COUNT] += 1
+            if row[COUNT_COLUMN] < MAX_COUNT:
+                row[COUNT_COLUMN] += 1
                 for k in range(3):
                     row[POSITION + k] += quanta[k, i] & QUANTUM_MASK
                     row[COLOR + k] += colors[begin + i, k]
@@ -228,7 +228,11 @@ def add_points(
 def fill_index(rows: Int32s, num_voxels: int, index: Int32s) -> None:
     """Enter the rows (n, 10) of `num_voxels` voxels in an index (2^k,) of zeros."""
     for k in range(num_voxels):
-        x, y, z = np.int64(rows[k, CELL]), np.int64(rows[k, CELL + 1]), np.int64(rows[k, CELL + 2])
+        x, y, z = (
+            np.int64(rows[k, CELL_COLUMN]),
+            np.int64(rows[k, CELL_COLUMN + 1]),
+            np.int64(rows[k, CELL_COLUMN + 2]),
+        )
         index[find_slot(index, rows, first_slot(index, x, y, z), x, y, z)] = k + 1
 
 
@@ -287,22 +291,22 @@ class VoxelTable:
         rows = self.rows[:num]
         self.rows = np.empty((0, NUM_COLUMNS), np.int32)
         rows, warnings = self._without_far(rows)
-        cells = [rows[:, k] for k in range(COUNT)]
+        cells = [rows[:, k] for k in range(COUNT_COLUMN)]
         low = np.array([column.min() for column in cells]) + self.base
         high = np.array([column.max() for column in cells]) + self.base + 1
-        parts = [slice(begin, begin + AT_ONCE) for begin in range(0, len(rows), AT_ONCE)]
+        parts = [slice(begin, begin + VOXELS_AT_ONCE) for begin in range(0, len(rows), VOXELS_AT_ONCE)]
         codes = np.empty(len(rows), np.int64)
         for part in parts:
-            codes[part] = morton_codes(rows[part, :COUNT] + (self.base - low // COARSEST * COARSEST))
+            codes[part] = morton_codes(rows[part, :COUNT_COLUMN] + (self.base - low // COARSEST * COARSEST))
         order = np.argsort(codes)
         # + 0.0 turns -0.0 into 0.0
         origin = np.round(0.5 * LEAF_SIZE * (low + high) - PHASE / QUANTA_PER_METRE) + 0.0
         nodes = np.empty((len(rows), 6), np.float32)
         for part in parts:
             taken = rows[order[part]]
-            counts = taken[:, COUNT].astype(np.float64)
+            counts = taken[:, COUNT_COLUMN].astype(np.float64)
             for k in range(3):
-                corners = (taken[:, CELL + k] + self.base[k]) * LEAF_SIZE - origin[k]
+                corners = (taken[:, CELL_COLUMN + k] + self.base[k]) * LEAF_SIZE - origin[k]
                 sums = taken[:, POSITION + k]
                 nodes[part, k] = corners + (sums / counts + 0.5 - PHASE) / QUANTA_PER_METRE
                 nodes[part, 3 + k] = taken[:, COLOR + k] / counts / 255.0
@@ -311,13 +315,13 @@ class VoxelTable:
     def _without_far(self, rows: Int32s) -> tuple[Int32s, tuple[str, ...]]:
         """Return the rows of voxels near the rest, and a warning if others were left out."""
         is_near = np.ones(len(rows), dtype=np.bool_)
-        for column in rows[:, :COUNT].T:
+        for column in rows[:, :COUNT_COLUMN].T:
             middle = int(np.partition(column, len(column) // 2)[len(column) // 2])
             if int(column.min()) < middle - WINDOW or int(column.max()) > middle + WINDOW:
                 is_near &= np.abs(column.astype(np.int64) - middle) <= WINDOW
         if is_near.all():
             return rows, ()
-        num_far = int(rows[~is_near, COUNT].sum(dtype=np.int64))
+        num_far = int(rows[~is_near, COUNT_COLUMN].sum(dtype=np.int64))
         text = f"{num_far} points farther than {WINDOW * LEAF_SIZE / 1000:.0f} km from the middle"
         if not is_near.any():
             raise InputError(f"{self.label}: {text}, and none nearer, wanted one scene")

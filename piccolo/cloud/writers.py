@@ -16,7 +16,7 @@ from ..files.atomic import replacing, replacing_by_library
 from ..geometry.pose import transform_points
 from ..jobs.memory import check_memory
 from .readers.ply import MAGIC, PlyHeader, place_of_vertices, read_columns, read_header
-from .readers.reader import CHUNK
+from .readers.reader import POINTS_A_CHUNK
 from .settings import METRES
 from .stream import CloudStream
 
@@ -154,7 +154,7 @@ def _write_copy(
     with header.path.open("rb") as file:
         lines = file.read(header.size).decode("ascii", "replace").splitlines()
     comments = [line.removeprefix("comment ") for line in lines if line.startswith("comment ")]
-    num_chunks = math.ceil(header.counts[header.index] / CHUNK)
+    num_chunks = math.ceil(header.counts[header.index] / POINTS_A_CHUNK)
     with writing_ply(out, comments, more) as writer:
         for some in cloud.show(columns, num_chunks, "write"):
             as_found = {name: _of_type(column, found[name]) for name, column in zip(names, some, strict=True)}

@@ -26,26 +26,26 @@ from ..optimize.gauss_newton import Equations, minimize
 from ..panorama import Panorama, texels
 from ..panorama.model import resize
 
-WIDTHS = 512, 1024, 2048  # [px] of the photos, from one round to the next
+ALIGNMENT_WIDTHS = 512, 1024, 2048  # [px] of the photos, from one round to the next
 POINTS_PER_PHOTO = 5000
-LEAST_POINTS = 40_000
+LEAST_ALIGNED_POINTS = 40_000
 MOST_SEEN = 6  # photos that count for a point: those that see it best
-AT_ONCE = 16  # photos whose weights for all points are held
+PHOTOS_AT_ONCE = 16  # photos whose weights for all points are held
 LOSS_SCALE = 20.0  # [8-bit levels] of the length of a colour difference
 NOISE = 10.0  # [8-bit levels] of one
 NUM_ALIKE = 30.0  # points that count as one: their errors are alike; with fewer, they outweigh the anchors
-NUM_STEPS = 15  # a round, at most
-SETTLED = 1e-4  # [rad, m] the largest part of a step after which a round ends
+NUM_ALIGNMENT_STEPS = 15  # a round, at most
+ALIGNMENT_SETTLED = 1e-4  # [rad, m] the largest part of a step after which a round ends
 DARKEST = 8.0  # [8-bit levels] darker and brighter colours say nothing of gains
-BRIGHTEST = 247.0
+BRIGHTEST_LEVEL = 247.0
 SCALE = 0.2  # of the logarithm of a ratio, beyond which it counts little: the photos show different things
-NUM_ROUNDS = 4
+NUM_ALIGNMENT_ROUNDS = 4
 SIGHT_WIDTH = 1024  # [px] of the sphere on which ranges are found
-BEHIND = np.float32(1.02)  # a point is hidden beyond the surface's range times this
+HIDDEN_BEYOND = np.float32(1.02)  # a point is hidden beyond the surface's range times this
 BEHIND_OFFSET = np.float32(0.03)  # [m] plus this
 NEIGHBOR = 2  # [px] between the pixels by which a surface's slope is found
 LEAST_COSINE = 0.02
-LEAST_RANGE = 0.3  # [m] nearer surfaces count as much as this
+LEAST_COUNTED_RANGE = 0.3  # [m] nearer surfaces count as much as this
 
 
 class Anchor(NamedTuple):
@@ -72,7 +72,7 @@ def look(octree: Octree, pose: Pose) -> Sight:
     normals = np.cross(across[NEIGHBOR:-NEIGHBOR], points[2 * NEIGHBOR :] - points[: -2 * NEIGHBOR])
     along = np.abs((normals * rays).sum(axis=-1))
     cosine = along / np.maximum(np.linalg.norm(normals, axis=-1), 1e-12)
-    weights = np.maximum(cosine, LEAST_COSINE) / np.maximum(ranges, LEAST_RANGE) ** 2
+    weights = np.maximum(cosine, LEAST_COSINE) / np.maximum(ranges, LEAST_COUNTED_RANGE) ** 2
     return Sight(ranges, np.where(ranges > 0.0, weights, 0.0).astype(np.float32))
 
 
@@ -89,7 +89,7 @@ def weigh_points(
         u, v = direction_to_pixel(x, y, z, np.sqrt(rho2), np.float32(width))
         i = min(whole(v), height - 1)
         j = min(whole(u), width - 1)
-        is_seen = np.sqrt(rho2 + z * z) <= sight.ranges[i, j] * BEHIND + BEHIND_OFFSET
+        is_seen = np.sqrt(rho2 + z * z) <= sight.ranges[i, j] * HIDDEN_BEYOND + BEHIND_OFFSET
         found[n] = sight.weights[i, j] if is_seen else F0
 
 
@@ -117,10 +117,10 @@ def align(
     Return also the gains (photos, 3) by which colours are multiplied, so that exposures agree.
     """
     leaves = octree.level(octree.leaf_size)
-    num_points = max(LEAST_POINTS, POINTS_PER_PHOTO * len(poses))
+    num_points = max(LEAST_ALIGNED_POINTS, POINTS_PER_PHOTO * len(poses))
     points = np.ascontiguousarray(leaves[:: -(-len(leaves) // num_points), :3])
     gains = np.ones((len(poses), 3), np.float32)
-    for width in WIDTHS:
+    for width in ALIGNMENT_WIDTHS:
         sized = [resize(panorama, width) for panorama in panoramas]
         images = [texels.pack_texels(panorama.rgb, panorama.is_valid) for panorama in sized]
         sightings = find_sightings(octree, points, poses, workers)
@@ -139,7 +139,7 @@ def find_sightings(octree: Octree, points: Array32, poses: Sequence[Pose], worke
         weigh_points(points, look(octree, pose), pose.R_cam_from_world, pose.center_world, found)
         return found
 
-    parts = (poses[begin : begin + AT_ONCE] for begin in range(0, len(poses), AT_ONCE))
+    parts = (poses[begin : begin + PHOTOS_AT_ONCE] for begin in range(0, len(poses), PHOTOS_AT_ONCE))
     weights = (found for part in parts for found in workers.map(weigh, part, "see"))
     return keep_best(weights, len(points), len(poses))
 
@@ -208,7 +208,7 @@ def agree(
     def move(at: list[Pose], delta: Array) -> list[Pose]:
         return [step(pose, delta[6 * k : 6 * k + 6]) for k, pose in enumerate(at)]
 
-    return minimize(equations, move, poses, NUM_STEPS, SETTLED)[0]
+    return minimize(equations, move, poses, NUM_ALIGNMENT_STEPS, ALIGNMENT_SETTLED)[0]
 
 
 @kernel
@@ -308,7 +308,7 @@ def balance(point: Int64s, photo: Int64s, values: Array32, num_photos: int) -> A
     `values` (S, 3) are what `photo` (S,) shows at `point` (S,), sorted by points. The logarithms of gains are
     found by robust least squares on those of ratios, their mean is 0.
     """
-    is_plain = np.asarray(np.all((values > DARKEST) & (values < BRIGHTEST), axis=1))  # not NaN either
+    is_plain = np.asarray(np.all((values > DARKEST) & (values < BRIGHTEST_LEVEL), axis=1))  # not NaN either
     logs = np.log(np.where(is_plain[:, None], values, 1.0).astype(np.float64))
     pairs = [np.empty((0, 2), np.int64)]
     for apart in range(1, num_photos):
@@ -322,7 +322,7 @@ def balance(point: Int64s, photo: Int64s, values: Array32, num_photos: int) -> A
     j = photo[b]
     ratios = logs[b] - logs[a]
     gains = np.zeros((num_photos, 3))
-    for _ in range(NUM_ROUNDS):
+    for _ in range(NUM_ALIGNMENT_ROUNDS):
         errors = ratios - (gains[i] - gains[j])
         _, weights = geman_mcclure((errors**2).sum(axis=1), SCALE**-2)
         gains = solve(i, j, ratios * weights[:, None], weights, num_photos)

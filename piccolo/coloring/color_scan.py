@@ -32,8 +32,8 @@ from ..scan_map.scan_map import SHAPE_ALONE, ScanMap, change_colors
 from .alignment import Anchor, Sight, align, look, weigh_points
 from .passersby import remove_passersby
 
-LEAST_PHOTOS = 2
-NUM_ROUNDS = 2  # in which photos are localized by the colours of the round before
+LEAST_COLORING_PHOTOS = 2
+NUM_COLORING_ROUNDS = 2  # in which photos are localized by the colours of the round before
 MOST_FOLDS = 8  # of photos that do not see each other's paint: each fold has a map of its own
 PIXEL_BYTES = 8  # of a photo that gives colours: RGB, whether it counts, and both packed
 PHOTO_BYTES = 40e6  # beside: its smaller copy, ranges around it, and its share of points that are aligned
@@ -41,11 +41,11 @@ PAIR_BYTES = 5 * 6 * 6 * 8  # of two photos: normal equations, and copies of the
 UNKNOWN_STD = np.radians(0.5), 0.03  # [rad], [m] of a pose without a covariance
 PAINT_STD = 0.008  # [m] of positions in a scan whose colours are all of photos that found each other
 PAINTED = "photos are localized by the colours that others gave to the scan"
-WIDTH = 4096  # [px] of a photo, at most
+MAX_COLORING_WIDTH = 4096  # [px] of a photo, at most
 SAMPLES = 1 << 21  # of photos at points, that a task holds
 LEAST_PAINTED = 0.25  # of what a photo sees that must have paint; with less, most right ones were refused
 MOST_PHOTOS = 255  # that are counted for a point
-FULL = np.float32(255.0)
+FULL_LEVEL = np.float32(255.0)
 
 
 class Brush(NamedTuple):
@@ -70,7 +70,7 @@ def make_brushes(
     """Return the photos at their poses in a map, with gains (photos, 3)."""
 
     def make(k: int) -> Brush:
-        shown = shrink(panoramas[k], WIDTH)
+        shown = shrink(panoramas[k], MAX_COLORING_WIDTH)
         image = texels.pack_texels(shown.rgb, shown.is_valid)
         return Brush(image, poses[k], gains[k], look(octree, poses[k]))
 
@@ -127,7 +127,7 @@ def read_colors(
         weights[n] *= texels.is_valid(t00, t10, t01, t11)
         blended = texels.bilinear_weights(fu, fv)
         for c in range(3):
-            colors[n, c] = min(texels.blend(t00, t10, t01, t11, blended, 8 * c) * gains[c], FULL)
+            colors[n, c] = min(texels.blend(t00, t10, t01, t11, blended, 8 * c) * gains[c], FULL_LEVEL)
 
 
 @kernel
@@ -186,9 +186,9 @@ def localize_by_colors(
     """
     results = list(by_shape)
     leaves = list_leaves(scan_map)
-    for number in range(NUM_ROUNDS):
+    for number in range(NUM_COLORING_ROUNDS):
         painters = [k for k, result in enumerate(results) if result.pose is not None]
-        if len(painters) < LEAST_PHOTOS:
+        if len(painters) < LEAST_COLORING_PHOTOS:
             break
         idle = [k for k in range(len(results)) if k not in painters]
         folds = [*filter(None, [*(painters[n::MOST_FOLDS] for n in range(MOST_FOLDS)), idle])]
@@ -273,13 +273,16 @@ def check_suffix(out: Path) -> None:
 def make_aligned_brushes(scan_map: ScanMap, results: Sequence[Result], workers: Workers) -> list[Brush]:
     """Align the photos that are localized, and return them as what gives colours."""
     found = [(result, result.pose) for result in results if result.pose is not None]
-    if len(found) < LEAST_PHOTOS:
-        raise InputError(f"found {len(found)} localized photos, wanted {LEAST_PHOTOS} or more for colours")
-    panoramas = [shrink(read_as_localized(found[0][0]), WIDTH)]
+    if len(found) < LEAST_COLORING_PHOTOS:
+        wanted = f"wanted {LEAST_COLORING_PHOTOS} or more for colours"
+        raise InputError(f"found {len(found)} localized photos, {wanted}")
+    panoramas = [shrink(read_as_localized(found[0][0]), MAX_COLORING_WIDTH)]
     bytes_each = PIXEL_BYTES * panoramas[0].is_valid.size + PHOTO_BYTES + PAIR_BYTES * len(found)
     check_memory(len(found) * bytes_each, f"colouring by {len(found)} photos", "localize fewer at once")
     panoramas += workers.map(
-        lambda result: shrink(read_as_localized(result), WIDTH), [result for result, _ in found[1:]], "read"
+        lambda result: shrink(read_as_localized(result), MAX_COLORING_WIDTH),
+        [result for result, _ in found[1:]],
+        "read",
     )
     poses = [scan_map.from_world(pose) for _, pose in found]
     anchors = [make_anchor(result, pose, at) for (result, pose), at in zip(found, poses, strict=True)]

@@ -21,20 +21,20 @@ from ..kernels.jit import F0, HALF, kernel
 from ..panorama import Panorama, texels
 from .alignment import MOST_SEEN, POINTS_PER_PHOTO, Sightings, find_sightings, read_all
 
-WIDTH = 256  # [px] of the cells in which votes are counted: 1.4 degrees each
-LEAST_POINTS = 200_000  # that are asked
+VOTE_WIDTH = 256  # [px] of the cells in which votes are counted: 1.4 degrees each
+LEAST_ASKED_POINTS = 200_000  # that are asked
 # Chosen on a house whose three photos have six people in one colour, or in clothes of several (CHANGELOG.md);
 # 30 and 40, 20 and 30, 5 and 7, 0.4 and 0.5 differ by 1 % of the points.
 MOST_APART = 40.0  # [8-bit levels] in any channel, between photos that agree
 ALIKE = np.float32(30.0)  # [8-bit levels] deviation of colours over which votes spread
-NEAR = np.float32(5.0)  # [cells] deviation of distances over which votes spread
-REACH = 12  # [cells] at most
-FEW = 1.0  # agreeing votes that every cell has: one contradiction alone says little
+VOTE_DEVIATION = np.float32(5.0)  # [cells] deviation of distances over which votes spread
+VOTE_REACH = 12  # [cells] at most
+FEW_VOTES = 1.0  # agreeing votes that every cell has: one contradiction alone says little
 MOST_BLAME = 0.5  # share of votes from which a cell gives no colours
 FIRST_BLAME = 0.1  # before votes are counted
-NUM_ROUNDS = 3  # of blame between two photos
+NUM_BLAME_ROUNDS = 3  # of blame between two photos
 MOST_OF_A_PHOTO = 0.5  # that is blamed; else its light is another
-MARGIN = 1  # [cells] around what is blamed
+BLAME_MARGIN = 1  # [cells] around what is blamed
 
 
 class Votes(NamedTuple):
@@ -50,7 +50,7 @@ def remove_passersby(
 ) -> list[Panorama]:
     """Return photos at poses in a map without the parts that the others contradict."""
     leaves = octree.level(octree.leaf_size)
-    num_points = max(LEAST_POINTS, POINTS_PER_PHOTO * len(poses))
+    num_points = max(LEAST_ASKED_POINTS, POINTS_PER_PHOTO * len(poses))
     points = np.ascontiguousarray(leaves[:: -(-len(leaves) // num_points), :3])
     sightings = find_sightings(octree, points, poses, workers)
     images = [texels.pack_texels(panorama.rgb, panorama.is_valid) for panorama in panoramas]
@@ -59,8 +59,8 @@ def remove_passersby(
     for k, pose in enumerate(poses):
         own = sightings.own[k]
         rays = (points[sightings.point[own]] - pose.center_world) @ pose.R_cam_from_world.T
-        i, j = compute_indices(rays, WIDTH)
-        cells[own] = (k * (WIDTH // 2) + i) * WIDTH + j
+        i, j = compute_indices(rays, VOTE_WIDTH)
+        cells[own] = (k * (VOTE_WIDTH // 2) + i) * VOTE_WIDTH + j
     blame = find_blame(cast_votes(sightings, values), cells, [p.rgb for p in panoramas], workers)
     is_asked = np.bincount(cells, minlength=blame.size).reshape(blame.shape) > 0
     return [
@@ -89,8 +89,8 @@ def cast_votes(sightings: Sightings, values: Array32) -> Votes:
 
 def find_blame(votes: Votes, cells: Int64s, pictures: Sequence[Bytes], workers: Workers) -> Array32:
     """Return the share of contradicting votes (photos, cells down, cells across), near and alike."""
-    shape = (len(pictures), WIDTH // 2, WIDTH)
-    num_cells = len(pictures) * (WIDTH // 2) * WIDTH
+    shape = (len(pictures), VOTE_WIDTH // 2, VOTE_WIDTH)
+    num_cells = len(pictures) * (VOTE_WIDTH // 2) * VOTE_WIDTH
     guides = [
         cv2.resize(rgb, shape[:0:-1], interpolation=cv2.INTER_AREA).astype(np.float32) for rgb in pictures
     ]
@@ -101,9 +101,9 @@ def find_blame(votes: Votes, cells: Int64s, pictures: Sequence[Bytes], workers: 
     def spread(k: int) -> None:
         found = np.empty_like(counted[k])
         spread_votes(counted[k], guides[k], found)
-        blame[k] = found[..., 0] / (found.sum(axis=-1) + FEW)
+        blame[k] = found[..., 0] / (found.sum(axis=-1) + FEW_VOTES)
 
-    for _ in range(NUM_ROUNDS):
+    for _ in range(NUM_BLAME_ROUNDS):
         own = blame.ravel()[cells[votes.pairs]] + 1e-3
         contradicted = votes.is_outvoted.astype(np.float64)
         contradicted[votes.pairs] = own / own.sum(axis=1, keepdims=True)
@@ -120,12 +120,12 @@ def spread_votes(votes: Array32, guide: Array32, found: Array32) -> None:
         for j in range(width):
             against = F0
             for_it = F0
-            for y in range(max(0, i - REACH), min(height, i + REACH + 1)):
-                for x in range(j - REACH, j + REACH + 1):
+            for y in range(max(0, i - VOTE_REACH), min(height, i + VOTE_REACH + 1)):
+                for x in range(j - VOTE_REACH, j + VOTE_REACH + 1):
                     at = x % width
                     if votes[y, at, 0] + votes[y, at, 1] == F0:
                         continue
-                    far = np.float32((y - i) ** 2 + (x - j) ** 2) / (NEAR * NEAR)
+                    far = np.float32((y - i) ** 2 + (x - j) ** 2) / (VOTE_DEVIATION * VOTE_DEVIATION)
                     unlike = F0
                     for c in range(3):
                         unlike += (guide[y, at, c] - guide[i, j, c]) ** 2
@@ -138,9 +138,9 @@ def spread_votes(votes: Array32, guide: Array32, found: Array32) -> None:
 
 def without(panorama: Panorama, is_blamed: Mask) -> Panorama:
     """Return a photo without its cells that are blamed, and those around them."""
-    size = 2 * MARGIN + 1
-    around = np.pad(is_blamed.astype(np.uint8), ((0, 0), (MARGIN, MARGIN)), mode="wrap")
-    grown = cv2.dilate(around, np.ones((size, size), np.uint8))[:, MARGIN:-MARGIN]
+    size = 2 * BLAME_MARGIN + 1
+    around = np.pad(is_blamed.astype(np.uint8), ((0, 0), (BLAME_MARGIN, BLAME_MARGIN)), mode="wrap")
+    grown = cv2.dilate(around, np.ones((size, size), np.uint8))[:, BLAME_MARGIN:-BLAME_MARGIN]
     height, width = panorama.is_valid.shape
     enlarged = cv2.resize(np.ascontiguousarray(grown), (width, height), interpolation=cv2.INTER_NEAREST)
     return replace(panorama, is_valid=panorama.is_valid & (enlarged == 0))

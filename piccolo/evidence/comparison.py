@@ -16,7 +16,7 @@ from ..judge.candidate import CONTRADICTS, Comparison, Unoccluded
 from ..kernels.jit import F0, copy_to, kernel
 from ..optimize.channel_loss import NUM_BLOCKS
 from ..panorama.local_normalization import opponent, zscore
-from ..panorama.texels import CHUNK, Texels, make_chunk, project, sample
+from ..panorama.texels import TEXEL_CHUNK, Texels, make_chunk, project, sample
 from ..problem.problem import Problem
 from ..problem.profile import VIEWS
 from ..views.points_around import round_position
@@ -43,8 +43,8 @@ def sample_photo(
     The camera's `center` (3,) [m] is relative to the point from which the offsets of the cells are measured.
     """
     p = make_chunk()
-    for lo in range(0, len(weights), CHUNK):
-        hi = min(lo + CHUNK, len(weights))
+    for lo in range(0, len(weights), TEXEL_CHUNK):
+        hi = min(lo + TEXEL_CHUNK, len(weights))
         x = offsets[0][lo:hi]
         y = offsets[1][lo:hi]
         z = offsets[2][lo:hi]

@@ -7,13 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Int64s, Mask
-from ..geometry.pose import Pose, log_so3, rotate_points, step, yaw_rotation
+from ..geometry.pose import Pose, rotate_points, step, step_between, yaw_rotation
 from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
 from ..geometry.sphere import compute_indices, find_cell, make_grid
 from ..jobs.threads import Workers
 from ..judge.candidate import Candidate
 from ..judge.case import UNKNOWN_ERRORS, Errors
-from ..judge.selection import SURE_MATCHES
 from ..kernels.jit import kernel
 from ..optimize.channel_loss import ChannelProblem, channel_equations, descend_channels, equations_by_part
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
@@ -33,20 +32,16 @@ ERROR_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one
 LEAST_INFORMATION = 1e-12  # of the greatest, in any direction
 LEAST_BLOCKS = 13  # fewer do not tell six dimensions
 ONE_BLOCK = 1.001  # above 1, so that one block may hold all information
-PIXEL_SHARE = 0.04  # of a pixel that is left in a pose, by trials with photos of 256 and 2048 px
 UNCALIBRATED = 0.005  # deviation of the focal length's logarithm: a calibration is better known
-UNCALIBRATED_SHARE = 0.15  # PIXEL_SHARE of a photo with unknown principal point and distortion
-LEAST_RANGE = 0.005 / math.radians(0.1)  # [m] for moves of differences: shorter ones are lost in noise
+LEAST_STEP_RANGE = 0.005 / math.radians(0.1)  # [m] for moves of differences: shorter ones are lost in noise
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
-TINY = 1e-12  # [rad^2, m^2] least variance of errors of one photo alone
-SCALE = LAST.limits.loss_scale * LEVELS_PER_UNIT
+TINY_VARIANCE = 1e-12  # [rad^2, m^2] least variance of errors of one photo alone
+COVARIANCE_SCALE = LAST.limits.loss_scale * LEVELS_PER_UNIT
 # normals (9, 3), in the camera's frame, of planes between halves: the seam of two lenses may have any azimuth
 NORMALS = np.array([*(yaw_rotation(k * math.pi / 8.0)[0] for k in range(8)), (0.0, 0.0, 1.0)])
-# of `score_halves`, by chance 1 in the mean; the best of nine planes has more in a quarter of photos
-MOST_SCORE = 3.0
 SEAMS = (0.25, 0.5, 0.75)  # of the points, on one side of a plane between parts of the scan
 SEAM_SCORE = 4.5  # of parts; single scans have more in a fifth of photos
-NUM_TRIED = 2  # planes
+NUM_TRIED_PLANES = 2  # planes
 HALF_LIMITS = (15, 1e-5)  # iterations of a half's descent, and tolerance [rad + m]
 
 
@@ -98,7 +93,7 @@ def compute_hessian(problem: ChannelProblem, pose: Pose, turn: float, median_ran
     The Gauss-Newton matrix ignores that the loss flattens, and would make deviations several times too small.
     The points of the problem are around the pose; the median of their ranges [m] makes moves of turns [rad].
     """
-    sizes = np.repeat([turn, turn * max(median_range, LEAST_RANGE)], 3)
+    sizes = np.repeat([turn, turn * max(median_range, LEAST_STEP_RANGE)], 3)
     ends = [step(pose, sign * delta) for delta in np.diag(sizes) for sign in (1.0, -1.0)]
     rotations = np.array([end.R_cam_from_world for end in ends])
     centers = np.array([end.center_world for end in ends]) - pose.center_world
@@ -177,7 +172,7 @@ def merge_covariances(found: Sequence[Array]) -> Array:
 def make_problem(points: Cells, image: Texels) -> ChannelProblem:
     """Make the problem of points, and the image that they are compared with."""
     return ChannelProblem(
-        points.offsets, to_levels(points.channels), points.weights, image.rgbx, image.width, SCALE
+        points.offsets, to_levels(points.channels), points.weights, image.rgbx, image.width, COVARIANCE_SCALE
     )
 
 
@@ -208,13 +203,13 @@ def descend_half(points: Cells, images: Sequence[Texels], pose: Pose) -> tuple[f
     It descends in the images from coarse to fine, and in the finest alone; the lower end counts. The finest
     alone can't correct degrees, and a coarse one misleads in flat places.
     """
+    start = Pose(pose.R_cam_from_world, np.zeros(3))  # around which the points are
     ends = []
     for way in (images, images[-1:]):
-        R = pose.R_cam_from_world.copy()
-        t = np.zeros(3)
+        R = start.R_cam_from_world.copy()
+        t = start.center_world.copy()
         losses = [descend_channels(make_problem(points, image), *HALF_LIMITS, R, t) for image in way]
-        delta = np.concatenate([log_so3(R @ pose.R_cam_from_world.T), pose.R_cam_from_world @ t])
-        ends.append((losses[-1], delta))
+        ends.append((losses[-1], step_between(start, Pose(R, t))))
     return min(ends, key=lambda end: end[0])
 
 
@@ -226,13 +221,15 @@ def split_by_planes(points: Cells, begins: Int64s) -> Mask:
     return np.asarray((NORMALS[:-1] @ middles.T > limits[..., None]).reshape(-1, len(middles)))
 
 
-def disagreement(photo: PhotoImages, points: Cells, pose: Pose, covariance: Array, workers: Workers) -> Array:
+def disagreement(
+    photo: PhotoImages, points: Cells, pose: Pose, covariance: Array, least: float, workers: Workers
+) -> Array:
     """Return what parts that disagree about the pose of a whole photo add to its `covariance` (6, 6).
 
     Lenses stitched with an error and scans out of shape leave a pose between those of the halves, far from
     both. Added are the covariance and the mean square of the steps to theirs. Parts of a scan that were moved
     against each other may lie beyond any plane, and a pose is right by one of them: the product of the steps
-    is added in all directions. Both are less for scores near chance.
+    is added in all directions. Both are less for scores near chance, halves' near `least`.
     """
     points, begins = sort_by_block(points)
     blocks_map = make_grid(ERROR_RINGS).directions[: len(begins) - 1]
@@ -247,11 +244,11 @@ def disagreement(photo: PhotoImages, points: Cells, pose: Pose, covariance: Arra
 
     added = np.zeros((6, 6))
     scores = score_halves(sums, is_ahead)
-    tried = [k for k in np.argsort(-scores)[:NUM_TRIED] if scores[k] > MOST_SCORE]
+    tried = [k for k in np.argsort(-scores)[:NUM_TRIED_PLANES] if scores[k] > least]
     if tried:
         ends = workers.map(separate, list(is_ahead[tried]), "covariance")
         steps = min(ends, key=lambda end: end[0])[1]
-        added += (1.0 - (MOST_SCORE / scores[tried[0]]) ** 2) * (covariance + 0.5 * steps.T @ steps)
+        added += (1.0 - (least / scores[tried[0]]) ** 2) * (covariance + 0.5 * steps.T @ steps)
     is_beyond = split_by_planes(points, begins)
     scores = score_halves(sums, is_beyond)
     seam = int(scores.argmax())
@@ -293,7 +290,7 @@ def split_errors(problem: Problem, pose: Pose, covariance: Array) -> PoseGaussia
     common = scan_covariance(problem.scan_map, median_range)
     common += layer_covariance(problem.scan_map, pose, median_range)
     variances, axes = np.linalg.eigh(covariance - common)
-    return PoseGaussian(pose, (axes * np.maximum(variances, TINY)) @ axes.T, common)
+    return PoseGaussian(pose, (axes * np.maximum(variances, TINY_VARIANCE)) @ axes.T, common)
 
 
 def estimate_errors(problem: Problem, candidate: Candidate, workers: Workers) -> Errors:
@@ -307,14 +304,14 @@ def estimate_errors(problem: Problem, candidate: Candidate, workers: Workers) ->
     if not problem.profile.is_narrow:
         return errors
     drawn = draw_near(problem, pose, candidate.drawn, workers)
-    by_matches = place_by_matches(pose, drawn.matches)
+    by_matches = place_by_matches(problem.method, pose, drawn.matches)
     if by_matches is None:
         return errors
     median_range = compute_median_range(problem.view_at(pose, "points"))
     of_layers = layer_covariance(problem.scan_map, pose, median_range)
     if errors.gaussian is not None:
         found = errors.gaussian.fuse(PoseGaussian(*by_matches, errors.gaussian.common))
-    elif (candidate.num_matches or 0) >= SURE_MATCHES:
+    elif (candidate.num_matches or 0) >= problem.method.sure_matches:
         found = PoseGaussian(*by_matches, scan_covariance(problem.scan_map, median_range) + of_layers)
     else:
         return errors
@@ -352,13 +349,15 @@ def estimate_covariance(
     median_range = compute_median_range(points)
     prior = problem.given.focal_prior
     is_calibrated = prior is None or prior.deviation < UNCALIBRATED
-    turn = (PIXEL_SHARE if is_calibrated else UNCALIBRATED_SHARE) * problem.pixel
+    method = problem.method
+    turn = (method.pixel_share if is_calibrated else method.uncalibrated_share) * problem.pixel
     of_grid = np.diag(np.repeat([turn**2, (turn * median_range) ** 2], 3))  # and of stitching, in all blocks
     own = turn_positions(covariance, turned) + of_grid
     common = scan_covariance(problem.scan_map, median_range)
     own, common = profile.own_share * own, common + (1.0 - profile.own_share) * own
     std_of_fit = largest_std(own + common)
     if profile.compares_halves:
-        own = own + turn_positions(disagreement(photo, points, pose, covariance, workers), turned)
+        added = disagreement(photo, points, pose, covariance, method.halves_score, workers)
+        own = own + turn_positions(added, turned)
     common = common + layer_covariance(problem.scan_map, pose, median_range)
     return Errors(PoseGaussian(pose, own, common), std_of_fit)

@@ -34,7 +34,7 @@ from ..problem.stages import Limits
 from ..views.view import Cells
 from .comparison import mask_occluders
 from .covariance import UNCALIBRATED, compute_median_range
-from .lens_matches import MOST, MatchFit, add_matches, fit_matches
+from .lens_matches import MOST_LENS_CHANGE, MatchFit, add_matches, fit_matches
 from .scan_errors import displacement_variance
 from .self_calibration import (
     Estimate,
@@ -56,20 +56,19 @@ NOT_CALIBRATED = (0.002, 0.005, 0.005, 0.008)
 OTHERS_WRONG = (0.05, 0.05, 0.05, 0.2)  # chosen: if they are wrong
 OTHERS_SHARES = (0.01, 0.01, 0.01, 0.01)  # chosen: of those that are wrong
 FIRST_CHANGES = (-0.1, 0.1)  # of the focal length's logarithm, from which first fits begin too
-BESIDE = (-0.03, 0.03)  # and from which descents begin once more: the loss is rough
-NUM_VIEWS = 2  # of the points, from where a descent ended
-FAR = 0.5  # [m] from the pose, where a descent shows that the photo fixes none
+CHANGES_BESIDE = (-0.03, 0.03)  # and from which descents begin once more: the loss is rough
+NUM_FOCAL_VIEWS = 2  # of the points, from where a descent ended
+FAR_AWAY = 0.5  # [m] from the pose, where a descent shows that the photo fixes none
 MOST_VARIANCE = 1.0  # of a focal length's logarithm: with more, the picture says nothing
 # deviations of corrections by which matches are fitted: of the focal length, and of all where descents begin
 FOCAL_WIDTHS = (0.5, *CALIBRATED)
 ALL_WIDTHS = (0.1, 0.05, 0.02, 0.02, 0.1)
 DISAGREE = 2.0  # deviations between picture and what was given, by which chance parts them in one of twenty
-EDGE_ERROR = 0.2  # chosen: [px] of the sphere at the picture's edge, which all blocks may have in common
 UNCONFIRMED = 0.1  # chosen: weight of a photo's own focal length, against the one given, in what it confirms
 AT_REST = 0.5  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
-EDGE = 17  # [px] of the sphere, around a point that shows nothing beyond the picture
-NEAR = Limits(1.0, 8, 1e-3)  # on fine cells, from another focal length
+EDGE_WIDTH = 17  # [px] of the sphere, around a point that shows nothing beyond the picture
+NEAR_LIMITS = Limits(1.0, 8, 1e-3)  # on fine cells, from another focal length
 CLOSE = Limits(0.7, 15, 1e-4)
 
 
@@ -146,9 +145,9 @@ def fit_focal(problem: Problem, best: Candidate, workers: Workers, is_first: boo
     assert prior is not None
     claim = make_claim(prior, camera)
     matches = list_matches(problem, best, workers)
-    starts = fit_matches(mount, best.pose, matches, ALL_WIDTHS)
+    starts = fit_matches(problem.method, mount, best.pose, matches, ALL_WIDTHS)
     near, far = descend_lens(problem, best, claim, starts, workers, is_first)
-    by_matches = fit_matches(mount, best.pose, matches, FOCAL_WIDTHS)
+    by_matches = fit_matches(problem.method, mount, best.pose, matches, FOCAL_WIDTHS)
     estimate = estimate_lens(problem, best.pose, near, by_matches)
     return weigh_claim(prior, camera, estimate, estimate_lens(problem, best.pose, far))
 
@@ -257,14 +256,16 @@ def descend_lens(
     shown = problem.show(mask_occluders(problem, best.seen, best.unoccluded).photo)
     corrections = Corrections(problem.given.cameras[0])
     wide = np.maximum(claim.wrong_deviations, claim.deviations)
-    of_focal = Freedom(corrections, np.where(np.arange(len(wide)) == FOCAL, wide, claim.deviations), MOST)
-    of_all = Freedom(corrections, wide, MOST)
+    of_focal = Freedom(
+        corrections, np.where(np.arange(len(wide)) == FOCAL, wide, claim.deviations), MOST_LENS_CHANGE
+    )
+    of_all = Freedom(corrections, wide, MOST_LENS_CHANGE)
     cells = shown.view_at(pose, "fine")
 
     def begin(change: float) -> FreeEnd:
         values = np.zeros(len(LENS))
         values[FOCAL] = change
-        return descend_freely(cells, shown.photo.image("fine"), of_focal, pose, values, NEAR)
+        return descend_freely(cells, shown.photo.image("fine"), of_focal, pose, values, NEAR_LIMITS)
 
     def find_lowest(freedom: Freedom, place: Pose, starts: Sequence[tuple[Pose, Array]]) -> FreeEnd:
         points = mask_edge(shown.view_at(place, "points"), place, problem.photo.panorama.is_valid)
@@ -281,10 +282,10 @@ def descend_lens(
     first = find_lowest(of_focal, pose, [(pose, np.zeros(len(LENS))), *(end.start for end in others)])
     motion = estimate_corrections(first).motion[:, FOCAL]
     unit = np.eye(len(LENS))[FOCAL]
-    beside = [(add(first.pose, motion * change), first.values + unit * change) for change in BESIDE]
+    beside = [(add(first.pose, motion * change), first.values + unit * change) for change in CHANGES_BESIDE]
     near = find_lowest(of_focal, pose, [first.start, *beside])
-    for _ in range(NUM_VIEWS):
-        if near.pose.distance(pose) > FAR:
+    for _ in range(NUM_FOCAL_VIEWS):
+        if near.pose.distance(pose) > FAR_AWAY:
             break
         near = find_lowest(of_focal, near.pose, [near.start])
     starts = [near.start, (by_matches.pose, by_matches.values)]
@@ -293,7 +294,7 @@ def descend_lens(
 
 def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
     """Remove the points near the edge of what a photo (H, W) shows, which corrections move across it."""
-    inner = cv2.erode(is_valid.view(np.uint8), np.ones((EDGE, EDGE), np.uint8))
+    inner = cv2.erode(is_valid.view(np.uint8), np.ones((EDGE_WIDTH, EDGE_WIDTH), np.uint8))
     offsets = points.around(pose.center_world).offsets.T.astype(np.float64)
     rays = rotate_points(offsets / np.linalg.norm(offsets, axis=1, keepdims=True), pose.R_cam_from_world)
     is_kept = inner[compute_indices(rays, is_valid.shape[1])] > 0
@@ -307,11 +308,11 @@ def estimate_lens(problem: Problem, pose: Pose, end: FreeEnd, by_matches: MatchF
     too, those of the scan.
     """
     estimate = estimate_corrections(end)
-    if end.pose.distance(pose) > FAR:
+    if end.pose.distance(pose) > FAR_AWAY:
         estimate = estimate._replace(information=np.zeros_like(estimate.information))
     camera = problem.given.cameras[0].camera
     per_px = math.tau * camera.focal[0] / (0.5 * camera.width * problem.photo.panorama.rgb.shape[1])
-    estimate = add_errors(estimate, (EDGE_ERROR * per_px) ** 2 * np.eye(len(LENS)))
+    estimate = add_errors(estimate, (problem.method.edge_error * per_px) ** 2 * np.eye(len(LENS)))
     if by_matches is not None:
         estimate = add_matches(estimate, by_matches)
     median_range = compute_median_range(problem.view_at(pose, "points"))

@@ -11,14 +11,14 @@ from ..camera.corrections import FOCAL, LENS, Corrections
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LOOSE, add, differentiate_rays
 from ..geometry.robust import geman_mcclure
-from ..judge.selection import SURE_MATCHES
 from ..local_features.matching import Matches
 from ..optimize.gauss_newton import sum_observations
 from ..optimize.self_calibration import NUM_OF_POSE
+from ..problem.method import Method
 from .self_calibration import Estimate, invert
 from .verification import LEAST_ERROR
 
-MOST = np.array([0.5, 0.2, 0.3, 0.3, 0.6])  # corrections that are searched
+MOST_LENS_CHANGE = np.array([0.5, 0.2, 0.3, 0.3, 0.6])  # corrections that are searched
 MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
 AGREES = 0.25  # least weight of a match that agrees
 MATCHED_DEVIATION = 0.015  # that errors in common add to a focal length by matches
@@ -43,12 +43,14 @@ def add_matches(estimate: Estimate, by_matches: MatchFit) -> Estimate:
     return estimate._replace(values=invert(both) @ goal, information=both)
 
 
-def fit_matches(camera: Mount, pose: Pose, matches: Matches, widths: tuple[float, ...]) -> MatchFit:
+def fit_matches(
+    method: Method, camera: Mount, pose: Pose, matches: Matches, widths: tuple[float, ...]
+) -> MatchFit:
     """Fit corrections of the lens and the pose to the matches with the scan drawn at a pose.
 
     `widths` (5,) are the deviations of the corrections. A match's loss becomes narrower from step to step.
     """
-    if len(matches.rays) < SURE_MATCHES:
+    if len(matches.rays) < method.sure_matches:
         return MatchFit(np.zeros(len(LENS)), 0.0, pose)
     corrections = Corrections(camera)
     prior = np.diag([0.0] * NUM_OF_POSE + list((LEAST_ERROR / np.array(widths)) ** 2))
@@ -66,10 +68,10 @@ def fit_matches(camera: Mount, pose: Pose, matches: Matches, widths: tuple[float
         found = found.add_known(np.zeros(len(prior)), LOOSE * np.eye(len(prior)))
         step = found.solve()
         end = add(end, step[:NUM_OF_POSE])
-        values = np.clip(values + step[NUM_OF_POSE:], -MOST, MOST)
+        values = np.clip(values + step[NUM_OF_POSE:], -MOST_LENS_CHANGE, MOST_LENS_CHANGE)
     weights = is_shown[:, 0] * robust(np.square(residuals).sum(axis=1))[1]
     slopes = np.einsum("n,nij,ni->nj", weights, J, residuals)
     of_focal = np.linalg.inv(found.matrix)[NUM_OF_POSE + FOCAL]
     variance = INFLATION * float(np.square(slopes @ of_focal).sum()) + MATCHED_DEVIATION**2
-    is_known = (weights > AGREES).sum() >= SURE_MATCHES and abs(values[FOCAL]) < LIMIT
+    is_known = (weights > AGREES).sum() >= method.sure_matches and abs(values[FOCAL]) < LIMIT
     return MatchFit(values, float(is_known / variance), end)

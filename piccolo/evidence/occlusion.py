@@ -24,19 +24,23 @@ from ..panorama.local_normalization import normalize_locally, opponent_channels
 from ..panorama.model import resize, shrink
 from ..views.zbuffer import View, render_view
 
-WIDTHS = (256, 128, 64)  # [px] of the comparison, cells of 1.4 degrees and more: where the scan is sparse
-LEAST_FILLED = 0.75  # of the cells twice as wide in which anything is seen: less is sparse
-STATS_WIDTH = 64  # [px] of local means
+OCCLUSION_WIDTHS = (
+    256,
+    128,
+    64,
+)  # [px] of the comparison, cells of 1.4 degrees and more: where the scan is sparse
+LEAST_FILLED_SHARE = 0.75  # of the cells twice as wide in which anything is seen: less is sparse
+OCCLUSION_STATS_WIDTH = 64  # [px] of local means
 SIGMA_DEG = 15.0  # of the Gaussian for contrast
-VIEW_WIDTH = 96  # [px] of the agreement, cells of 3.75 degrees
-NUM_ROUNDS = 3  # of statistics over what agrees
+AGREEMENT_WIDTH = 96  # [px] of the agreement, cells of 3.75 degrees
+NUM_STATISTICS_ROUNDS = 3  # of statistics over what agrees
 FLAT_VARIANCE = np.float32(0.08**2)  # of a channel in [0, 1]: where it is less, a difference counts less
 CONTRADICTING = 0.8  # squared deviations, summed over channels; also the scale of Geman and McClure's weights
-AROUND = np.ones((3, 3), np.uint8)  # of a cell: an edge may be displaced by one
+CELL_AROUND = np.ones((3, 3), np.uint8)  # of a cell: an edge may be displaced by one
 EXPLAINED = 0  # levels of the mask
 NOT_SCANNED = 128
-CONTRADICTED = 255
-HALF = 127  # level of a cell's edge in an enlarged mask
+CONTRADICTED_LEVEL = 255
+EDGE_LEVEL = 127  # level of a cell's edge in an enlarged mask
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,7 @@ def compare_occlusion(points: PackedPoints, panorama: Panorama, pose: Pose) -> O
     shared = weight = is_shared.astype(np.float32)
     difference = np.empty_like(weight)
     is_seen = is_shared[..., None]
-    for _ in range(NUM_ROUNDS):
+    for _ in range(NUM_STATISTICS_ROUNDS):
         photo = _statistics(of_photo, weight)
         scan = _statistics(of_scan, weight)
         contrast = (of_scan - scan[..., :3]) * scan[..., 3:]
@@ -79,17 +83,17 @@ def compare_occlusion(points: PackedPoints, panorama: Panorama, pose: Pose) -> O
 
 def _fill_view(points: PackedPoints, pose: Pose) -> View:
     """Render the scan at a pose on the smallest cells that its points fill."""
-    view = render_view(points, pose, WIDTHS[0])
-    for width in WIDTHS[1:]:
+    view = render_view(points, pose, OCCLUSION_WIDTHS[0])
+    for width in OCCLUSION_WIDTHS[1:]:
         wider = view.is_seen.reshape(width // 2, 2, width, 2).any(axis=(1, 3))
-        if view.is_seen.mean() >= LEAST_FILLED * wider.mean():
+        if view.is_seen.mean() >= LEAST_FILLED_SHARE * wider.mean():
             break
         view = render_view(points, pose, width)
     return view
 
 
 def occlusion_mask(points: PackedPoints, panorama: Panorama, pose: Pose) -> Bytes:
-    """Draw the comparison (H, W) at the panorama's size: EXPLAINED, NOT_SCANNED or CONTRADICTED.
+    """Draw the comparison (H, W) at the panorama's size: EXPLAINED, NOT_SCANNED or CONTRADICTED_LEVEL.
 
     Masked pixels count as not scanned.
     """
@@ -97,12 +101,12 @@ def occlusion_mask(points: PackedPoints, panorama: Panorama, pose: Pose) -> Byte
     shape = panorama.is_valid.shape
 
     def enlarge(cells: Mask) -> Mask:
-        return _enlarge(cells.view(np.uint8) * np.uint8(255), shape) > HALF
+        return _enlarge(cells.view(np.uint8) * np.uint8(255), shape) > EDGE_LEVEL
 
     mask = np.full(shape, NOT_SCANNED, np.uint8)
     is_compared = enlarge(small.is_compared) & panorama.is_valid
     is_contradicted = enlarge(small.is_contradicted)
-    mask[is_compared & is_contradicted] = CONTRADICTED
+    mask[is_compared & is_contradicted] = CONTRADICTED_LEVEL
     mask[is_compared & ~is_contradicted] = EXPLAINED
     return mask
 
@@ -132,9 +136,9 @@ def write_squares(
 
 def _statistics(channels: Array32, weight: Array32) -> Array32:
     """Return local means and 1 / deviations (H, W, 6) of channels (H, W, 3), half of them the global ones."""
-    moments = np.empty((STATS_WIDTH // 2, STATS_WIDTH, 7), np.float32)
+    moments = np.empty((OCCLUSION_STATS_WIDTH // 2, OCCLUSION_STATS_WIDTH, 7), np.float32)
     local_normalization.block_moments(channels, weight, moments)
-    total = (moments * solid_angles(STATS_WIDTH)[:, None, None]).sum(axis=(0, 1))
+    total = (moments * solid_angles(OCCLUSION_STATS_WIDTH)[:, None, None]).sum(axis=(0, 1))
     # what blur_sphere makes of full blocks: the integral of exp((cosine - 1) / sigma^2)
     full = math.tau * math.radians(SIGMA_DEG) ** 2 * weight.size / moments[..., 0].size
     sums = local_normalization.blur_sphere(moments, SIGMA_DEG)
@@ -146,7 +150,7 @@ def _statistics(channels: Array32, weight: Array32) -> Array32:
 def _extreme(values: NDArray[Any], of: Any) -> NDArray[Any]:
     """Return the extreme (H, W, ...), by cv2.erode or cv2.dilate, of a cell and its eight neighbours."""
     padded = np.concatenate([values[:, -1:], values, values[:, :1]], axis=1)
-    return np.asarray(of(padded, AROUND)[:, 1:-1])
+    return np.asarray(of(padded, CELL_AROUND)[:, 1:-1])
 
 
 def _enlarge(small: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
@@ -178,10 +182,10 @@ class Agreement:
 
 def measure_agreement(points: PackedPoints, panorama: Panorama, pose: Pose) -> Agreement:
     """Measure the agreement of the panorama with the cloud seen from `pose`."""
-    small = shrink(panorama, VIEW_WIDTH)
-    view = render_view(points, pose, VIEW_WIDTH)
+    small = shrink(panorama, AGREEMENT_WIDTH)
+    view = render_view(points, pose, AGREEMENT_WIDTH)
     is_shared = view.is_seen & small.is_valid
-    weights = is_shared * (solid_angles(VIEW_WIDTH)[:, None] / (4.0 * math.pi))
+    weights = is_shared * (solid_angles(AGREEMENT_WIDTH)[:, None] / (4.0 * math.pi))
     of_view = normalize_locally(view.rgb, is_shared, SIGMA_DEG)
     of_panorama = normalize_locally(small.rgb.astype(np.float32) / np.float32(255.0), is_shared, SIGMA_DEG)
 

@@ -30,17 +30,17 @@ CLAIM = Claim(
     wrong_deviations=np.array([0.05, 0.1, 0.1]),  # chosen
     wrong_shares=np.array([0.005, 0.005, 0.005]),  # chosen
 )
-CURVATURE = 0.5  # as of `self_calibration`, but of whole panoramas, whose loss flattens less
+SPHERE_CURVATURE = 0.5  # as of `self_calibration`, but of whole panoramas, whose loss flattens less
 BY_CHANCE = 12.0  # squared deviations of the corrections together that a right claim may have
-MOST = np.array([0.2, 0.6, 0.4])  # corrections that are searched
+MOST_SPHERE_CHANGE = np.array([0.2, 0.6, 0.4])  # corrections that are searched
 ANY = np.full(3, np.inf)
-HEIGHTS = -np.log([1.0, 0.9, 0.8, 0.72])  # corrections of the height from which descents begin
+HEIGHT_STARTS = -np.log([1.0, 0.9, 0.8, 0.72])  # corrections of the height from which descents begin
 LEAST_CUT = 0.1  # of the height, for which the horizons of starts are spread
 HORIZONS = (-1.0, -0.5, 0.0, 0.5, 1.0)  # where all, three quarters or half is cut off at one end
 NUM_ENDS = 3  # of the descents on coarse cells, that go on
-COARSE = Limits(1.2, 10, 5e-3)
-MIDDLE = Limits(1.2, 12, 1e-3)
-FINE = Limits(1.0, 15, 1e-3)
+COARSE_LIMITS = Limits(1.2, 10, 5e-3)
+MIDDLE_LIMITS = Limits(1.2, 12, 1e-3)
+FINE_LIMITS = Limits(1.0, 15, 1e-3)
 
 
 class SphereFit(NamedTuple):
@@ -86,7 +86,7 @@ class SphereFit(NamedTuple):
 
 def make_freedom(camera: Camera) -> Freedom:
     """Free all corrections of a panorama."""
-    return Freedom(Corrections(Mount(camera)), ANY, MOST)
+    return Freedom(Corrections(Mount(camera)), ANY, MOST_SPHERE_CHANGE)
 
 
 def count_deviations(estimate: Estimate) -> float:
@@ -104,15 +104,15 @@ def search_geometry(problem: Problem, pose: Pose, claimed: Camera, workers: Work
         height, share = start
         horizon = share * max(1.0 - math.exp(-height), LEAST_CUT) * 0.5 * math.pi
         values = np.array([0.0, height, horizon])
-        return descend_freely(cells, problem.photo.image("search"), freedom, pose, values, COARSE)
+        return descend_freely(cells, problem.photo.image("search"), freedom, pose, values, COARSE_LIMITS)
 
     def go_on(end: FreeEnd) -> FreeEnd:
         middle = problem.view_at(end.pose, "middle")
         image = problem.photo.image("middle")
-        end = descend_freely(middle, image, freedom, end.pose, end.values, MIDDLE)
+        end = descend_freely(middle, image, freedom, end.pose, end.values, MIDDLE_LIMITS)
         fine = problem.view_at(end.pose, "fine")
-        return descend_freely(fine, problem.photo.image("fine"), freedom, end.pose, end.values, FINE)
+        return descend_freely(fine, problem.photo.image("fine"), freedom, end.pose, end.values, FINE_LIMITS)
 
-    starts = list(itertools.product(HEIGHTS, HORIZONS))
+    starts = list(itertools.product(HEIGHT_STARTS, HORIZONS))
     ends = sorted(workers.map(begin, starts, "fit the panorama"), key=lambda end: end.loss)
     return min(workers.map(go_on, ends[:NUM_ENDS], "fit the panorama"), key=lambda end: end.loss)

@@ -5,7 +5,6 @@ scan lie. After Torii et al., "24/7 Place Recognition by View Synthesis" (CVPR 2
 verification of poses (Taira et al., CVPR 2018). Photos beside it in a walk are such pictures too.
 """
 
-import math
 from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
@@ -21,19 +20,18 @@ from ..geometry.pose_gaussian import LOOSE, differentiate_rays
 from ..geometry.sphere import compute_indices
 from ..jobs.threads import Workers
 from ..judge.candidate import Drawn
-from ..judge.selection import CHANCE_MATCHES
 from ..local_features.hypotheses import COS_EXACT, LEAST_MATCHES, count_matches, exact_pose, find_inliers
 from ..local_features.keypoints import Keypoints, find_in_view, join_keypoints
 from ..local_features.matching import NO_MATCHES, Matches, match_pictures, merge_matches
 from ..local_features.perspective_view import PerspectiveView, add_margin
 from ..local_features.view_image import ViewImage, render_gray
+from ..problem.method import Method
 from ..problem.problem import Problem
 from .occlusion import EXPLAINED, occlusion_mask
 
 PLACE = 0.1  # [m] the scan is drawn at positions on a grid of this spacing
 TURN = 0.05  # [rad] and at rotation vectors on one of this
-AROUND = 12  # [px] around the photo that are drawn too: it moves when the pose is refined
-COS_AGREE = math.cos(math.radians(0.5))  # matches with a smaller error agree
+DRAWN_AROUND = 12  # [px] around the photo that are drawn too: it moves when the pose is refined
 LEAST_ERROR = 2e-3  # [rad] of a keypoint along an axis: a third of a pixel
 # of the covariance by matches with the drawn scan, whose errors are not independent: by 76 crops of three
 # scenes
@@ -65,16 +63,17 @@ def verify(problem: Problem, pose: Pose, drawn: Matches) -> Verified:
     found = exact_pose(merge_matches(pictures), pose)
     if found is None:
         return Verified(pose, 0)
-    return Verified(found.pose, max(count_matches(matches, found.pose, COS_AGREE) for matches in pictures))
+    cos_agree = problem.method.cos_agree
+    return Verified(found.pose, max(count_matches(matches, found.pose, cos_agree) for matches in pictures))
 
 
-def place_by_matches(pose: Pose, matches: Matches) -> tuple[Pose, Array] | None:
+def place_by_matches(method: Method, pose: Pose, matches: Matches) -> tuple[Pose, Array] | None:
     """Return the pose near another with which most matches with the drawn scan agree, and its covariance.
 
     None if no more agree than by chance. The covariance (6, 6) is as of `PoseGaussian`.
     """
     found = exact_pose(matches, pose)
-    if found is None or found.num_matches <= CHANCE_MATCHES or not CONFIRMED.holds(found.pose, pose):
+    if found is None or found.num_matches <= method.chance_matches or not CONFIRMED.holds(found.pose, pose):
         return None
     return found.pose, DRAWN_INFLATION * match_covariance(matches, found.pose)
 
@@ -167,7 +166,7 @@ def match_beside(problem: Problem, other: Located, workers: Workers) -> Matches:
         return NO_MATCHES
     matches = pair(own, mine, other, theirs)
     rays_of_other = rotate_points(matches.directions.astype(np.float64), other.pose.R_cam_from_world)
-    return matches.take(np.sum(rays_of_other * matches.rays, axis=1) < COS_AGREE)
+    return matches.take(np.sum(rays_of_other * matches.rays, axis=1) < problem.method.cos_agree)
 
 
 def match_located(own: Keypoints, picture: Located) -> Matches:
@@ -198,7 +197,7 @@ def pair(own: Keypoints, mine: NDArray[np.intp], picture: Located, theirs: NDArr
 def draw(problem: Problem, pose: Pose, view: PerspectiveView) -> tuple[ViewImage, Bytes]:
     """Draw what a view of a photo would show at a pose, and a little around; return also its mask."""
     mask = view.cut_mask(add_margin(problem.photo.panorama.is_valid))
-    shown = cv2.dilate(mask, np.ones((2 * AROUND + 1,) * 2, np.uint8))
+    shown = cv2.dilate(mask, np.ones((2 * DRAWN_AROUND + 1,) * 2, np.uint8))
     turned = Pose(view.R_sphere_from_view.T @ pose.R_cam_from_world, pose.center_world)
     return render_gray(problem.scan_map.octree, turned, shown > 0, view.focal), np.asarray(shown, np.uint8)
 

@@ -51,7 +51,7 @@ COLUMNS = (
     *("quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z"),  # of R_cam_from_world
     *("heading_deg", "pitch_deg", "roll_deg"),
 )
-STEP = 10.0  # [m] ahead, to find true north
+NORTH_STEP = 10.0  # [m] ahead, to find true north
 MARGIN_DEG = 3.0  # around a system's area: a country that spans two zones often uses one for both
 LOCAL = 10_000.0  # [m] from (0, 0): without a margin, as scans with coordinates of their own lie there
 GPX_NAMESPACE = "http://www.topografix.com/GPX/1/1"
@@ -180,8 +180,8 @@ def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[s
     x, y, z = image.pose.center_world.tolist()
     heading, pitch, roll = heading_pitch_roll_deg(image.pose)
     ahead = np.radians(heading)
-    eastings = [x, x + STEP * np.sin(ahead)]
-    northings = [y, y + STEP * np.cos(ahead)]
+    eastings = [x, x + NORTH_STEP * np.sin(ahead)]
+    northings = [y, y + NORTH_STEP * np.cos(ahead)]
     longitudes, latitudes = transformer.transform(eastings, northings)
     true_heading, _, _ = geod.inv(longitudes[0], latitudes[0], longitudes[1], latitudes[1])
     properties = {

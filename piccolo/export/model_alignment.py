@@ -37,10 +37,10 @@ from ..together.bundle_search import move_origin_near
 from .colmap import read_model, write_model
 from .reconstructions import write_json
 
-LEAST_PHOTOS = 3
+LEAST_MODEL_PHOTOS = 3
 MOST_SCALE = 0.1  # chosen: deviation of the logarithm of a scale that is still told
 MADE = 1e-3  # chosen: of a deviation; a pose that was computed is nearer to where it was put
-NUM_ROUNDS = 4  # in which the errors of the model and its place are estimated in turn
+NUM_MODEL_ROUNDS = 4  # in which the errors of the model and its place are estimated in turn
 WANTED_OPENSFM = "wanted OpenSfM's reconstruction.json; of another model take the matrix"
 LOCAL = (
     'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
@@ -79,9 +79,9 @@ def fit_alignment(model: Path, results: Sequence[Result]) -> Alignment:
     sure = [(Path(result.pano), result) for result in results if result.pose is not None]
     relative = read_relative_poses(file_of_poses(model), [path for path, _ in sure])
     known = [(result, pose) for (_, result), pose in zip(sure, relative, strict=True) if pose is not None]
-    if len(known) < LEAST_PHOTOS:
+    if len(known) < LEAST_MODEL_PHOTOS:
         found = f"found {len(known)} localized photos of it in the results"
-        raise InputError(f"{model}: {found}, wanted {LEAST_PHOTOS} or more")
+        raise InputError(f"{model}: {found}, wanted {LEAST_MODEL_PHOTOS} or more")
     middle = np.mean([pose.center_world for _, pose in known], axis=0)
     near = move_origin_near([pose for _, pose in known])
     none = np.zeros((6, 6))
@@ -94,7 +94,7 @@ def fit_alignment(model: Path, results: Sequence[Result]) -> Alignment:
     bundle = _begin(estimates, free)
     own_covariances = [own.own for own, _ in estimates]
     errors = free
-    for _ in range(NUM_ROUNDS):
+    for _ in range(NUM_MODEL_ROUNDS):
         adjusted = adjust(bundle, estimates, errors)
         bundle = adjusted.bundle
         steps = _find_steps(estimates, bundle)

@@ -23,9 +23,9 @@ from ..views.pictures import encode_image
 from .posed_images import Options, PosedImage
 from .scan_points import find_points
 
-FARTHEST = 8192.0  # [m] up to which float32 rounds by less than half a millimetre
-MAX_WIDTH = 2048  # [px] of a picture
-SHOWN = 0.4  # [m] of axes, and of a picture from its camera
+FARTHEST_SHOWN = 8192.0  # [m] up to which float32 rounds by less than half a millimetre
+MAX_RERUN_WIDTH = 2048  # [px] of a picture
+SHOWN_AXES = 0.4  # [m] of axes, and of a picture from its camera
 POINT = 0.01  # [m]
 
 
@@ -48,7 +48,7 @@ def write_rerun(images: Sequence[PosedImage], out: Path, options: Options) -> No
         transform = rr.Transform3D(translation=pose.center_world, mat3x3=pose.R_cam_from_world.T)
         sure = rr.AnyValues(status=image.result.status, confidence=image.result.confidence)
         place = ["photos", *image.name.split("/")]
-        recording.log(place, transform, rr.TransformAxes3D(SHOWN), sure, static=not is_timed)
+        recording.log(place, transform, rr.TransformAxes3D(SHOWN_AXES), sure, static=not is_timed)
         for part in _picture(rr, image, options):
             recording.log([*place, "image"], part, static=not is_timed)
     write_atomically(out, content.read())
@@ -56,7 +56,7 @@ def write_rerun(images: Sequence[PosedImage], out: Path, options: Options) -> No
 
 def check_float32(image: PosedImage) -> None:
     """Refuse a camera so far from the origin that Rerun would round its place."""
-    if np.abs(image.pose.center_world).max() > FARTHEST:
+    if np.abs(image.pose.center_world).max() > FARTHEST_SHOWN:
         found = f"found a camera at {np.round(image.pose.center_world, 1).tolist()}"
         raise InputError(f"{image.path}: {found}, wanted `offset` X Y Z, as Rerun computes in 32 bits")
 
@@ -76,12 +76,12 @@ def _set_time(recording: Any, image: PosedImage, options: Options) -> bool:
 
 def _picture(rr: Any, image: PosedImage, options: Options) -> list[Any]:
     """Return the pinhole, if the lens is one, and the picture as it takes it; with `size` none is opened."""
-    lens = image.lens.scale_to_width(min(image.lens.width, MAX_WIDTH))
+    lens = image.lens.scale_to_width(min(image.lens.width, MAX_RERUN_WIDTH))
     size = lens.width, lens.height
     parts = []
     if lens.lens == PERSPECTIVE:
         own = {"focal_length": lens.focal, "principal_point": lens.center, "resolution": size}
-        parts.append(rr.Pinhole(**own, image_plane_distance=SHOWN))
+        parts.append(rr.Pinhole(**own, image_plane_distance=SHOWN_AXES))
     if options.size is None:
         rgb = cv2.resize(read_picture(image.path).rgb, size, interpolation=cv2.INTER_AREA)
         content = encode_image(_undistort(np.asarray(rgb, np.uint8), lens), ".jpg")

@@ -25,8 +25,8 @@ from ..jobs.memory import check_memory
 ALIGNMENT = 64  # [byte]
 PADDING_ID = 0xD935  # of the extra field of a member's header, as zipalign has it
 LOCAL_HEADER = struct.Struct("<4s22xHH")  # magic, lengths of the name and of the extra field behind it
-MAX_HEADER_SIZE = 4096  # [byte] of an array's header
-MAX_HEAD_SIZE = MAX_HEADER_SIZE + 12  # with what stands before it
+MAX_ARRAY_HEADER_SIZE = 4096  # [byte] of an array's header
+MAX_HEAD_SIZE = MAX_ARRAY_HEADER_SIZE + 12  # with what stands before it
 QUOTED = re.compile(rb"'[^']*'|\"[^\"]*\"")
 HEADER_READERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
@@ -37,7 +37,9 @@ def write_archive(file: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
         for name, array in arrays.items():
             info = zipfile.ZipInfo(f"{name}.npy")
             info.CRC = info.compress_size = 0  # until it is written
-            info.file_size = array.nbytes + MAX_HEADER_SIZE  # by which zipfile chooses the header's form
+            info.file_size = (
+                array.nbytes + MAX_ARRAY_HEADER_SIZE
+            )  # by which zipfile chooses the header's form
             is_large = info.file_size * 1.05 > zipfile.ZIP64_LIMIT
             begin = file.tell() + len(info.FileHeader(is_large)) + 4
             size = -begin % ALIGNMENT
@@ -57,7 +59,7 @@ def read_header(head: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]
         raise ValueError(f"an array of version {version[0]}.{version[1]}, wanted 1.0 or 2.0")
     if b"L" in QUOTED.sub(b"", head[file.tell() + 2 * version[0] :].partition(b"}")[0]):
         raise ValueError("a header of Python 2")
-    shape, is_fortran, dtype = HEADER_READERS[version](file, max_header_size=MAX_HEADER_SIZE)
+    shape, is_fortran, dtype = HEADER_READERS[version](file, max_header_size=MAX_ARRAY_HEADER_SIZE)
     return shape, is_fortran, dtype, file.tell()
 
 

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from ..errors import InputError, unreadable
 
 Value = TypeVar("Value")
-MAX_SIZE = 1 << 26  # [byte] of a file that is read whole
+MAX_JSON_SIZE = 1 << 26  # [byte] of a file that is read whole
 # what damaged JSON, or JSON of another kind, raises while it is parsed and its fields are read
 DAMAGE = (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, ValueError)
 
@@ -57,7 +57,7 @@ def reading_once() -> Iterator[None]:
         _held.reset(token)
 
 
-def read_text(path: Path, wanted: str, max_size: int = MAX_SIZE) -> str:
+def read_text(path: Path, wanted: str, max_size: int = MAX_JSON_SIZE) -> str:
     """Return the text of a UTF-8 file, or of one in UTF-16 with a mark."""
     content = read_bytes(path, wanted, max_size)
     try:

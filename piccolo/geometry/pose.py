@@ -18,7 +18,7 @@ MAX_DISTANCE = 0.1  # [m] the paper's line between correct and wrong
 MAX_ANGLE = math.radians(5.0)
 MAX_SKEW = 1e-3  # of R R^T from the identity, in poses from outside: matrices are written with few digits
 MAX_COORDINATE = 1e8  # [m], ten times the Earth: beyond it lie only broken numbers, and float32 gives way
-TINY = 1e-150  # sine of an angle; of smaller ones the direction is lost to underflow
+TINY_SINE = 1e-150  # sine of an angle; of smaller ones the direction is lost to underflow
 # of a query: known: the camera is upright, up to yaw; unknown: any rotation; auto: both are tried
 Gravity = Literal["auto", "known", "unknown"]
 
@@ -227,7 +227,7 @@ def rotation_to_z(direction: Array) -> Array:
     """Return the smallest rotation (3, 3) that takes a unit vector (3,) to +z; half a turn about x for -z."""
     x, y, z = direction
     sine = math.hypot(x, y)
-    if sine < TINY:
+    if sine < TINY_SINE:
         return np.diag([1.0, 1.0, 1.0] if z > 0.0 else [1.0, -1.0, -1.0])
     return exp_so3(math.atan2(sine, z) / sine * np.array([y, -x, 0.0]))
 

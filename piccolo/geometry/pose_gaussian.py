@@ -15,7 +15,7 @@ from .pose import MAX_DISTANCE, Pose, exp_so3, log_so3, orthonormal, rotate_poin
 
 LIKELY = 12.6  # chi square of 6 at 95 %: poses that differ by more contradict each other
 LEAST_VARIANCE = 1e-18  # [m^2]
-FARTHEST = 8.0  # deviations that an integral goes to
+MOST_DEVIATIONS = 8.0  # deviations that an integral goes to
 NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(64)
 COSINES = np.cos((np.arange(32) + 0.5) * math.pi / 32.0)  # of directions in half a turn
 LOOSE = 1e-6  # [1/rad^2, 1/m^2] information that makes matrices invertible
@@ -94,7 +94,7 @@ def probability_of_ball(covariance: Array, radius: float) -> float:
     """
     variances = np.maximum(np.linalg.eigvalsh(covariance), LEAST_VARIANCE)
     std = math.sqrt(variances[2])
-    reach = min(radius, FARTHEST * std)
+    reach = min(radius, MOST_DEVIATIONS * std)
     along = reach * NODES
     density = np.exp(-0.5 * (along / std) ** 2) / (std * math.sqrt(math.tau))
     across = variances[0] * COSINES**2 + variances[1] * (1.0 - COSINES**2)

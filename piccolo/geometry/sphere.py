@@ -19,7 +19,7 @@ from ..kernels.jit import F0, HALF, Scalar, inline_kernel
 
 PI = np.float32(math.pi)
 HALF_PI = np.float32(math.pi / 2)
-TINY = np.float32(1e-18)
+TINY_LENGTH = np.float32(1e-18)
 
 # the text with which files describe their poses
 CONVENTION = (
@@ -47,7 +47,7 @@ def atan2(y: Scalar, x: Scalar) -> Scalar:
     """Return the angle [rad] of (x, y) in (-pi, pi], float32, within 6e-7 of math.atan2; 0 at the origin."""
     abs_x: Any = abs(x)  # of a union abs has no type
     abs_y: Any = abs(y)
-    q = min(abs_x, abs_y) / max(abs_x, abs_y, TINY)
+    q = min(abs_x, abs_y) / max(abs_x, abs_y, TINY_LENGTH)
     s = q * q
     angle: Scalar = q * (A0 + s * (A1 + s * (A2 + s * (A3 + s * (A4 + s * (A5 + s * A6))))))
     angle = HALF_PI - angle if abs_y > abs_x else angle
@@ -74,7 +74,7 @@ def pixel_jacobian(
     derivative, the divisor stays above zero and the numbers finite.
     """
     scale = width / (PI + PI)
-    rho2 = max(rho2, TINY)
+    rho2 = max(rho2, TINY_LENGTH)
     per_rho2 = scale / rho2
     per_rho_r2 = scale / (math.sqrt(rho2) * (rho2 + z * z))
     return y * per_rho2, -x * per_rho2, x * z * per_rho_r2, y * z * per_rho_r2, -rho2 * per_rho_r2

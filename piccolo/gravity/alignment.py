@@ -13,23 +13,23 @@ from ..arrays import Array, Array32, Int64s, Mask
 from ..cloud.octree import Octree
 
 # Chosen by hand; the noise of scanners (2 to 5 mm) is far below the spacing of the points
-SPACING = 0.08  # of the points that are used [m]
-MAX_POINTS = 40_000  # that get a normal: a plane of 1 % of the cloud still has 400
-NUM_NEIGHBORS = 24  # with the point itself: at 8 cm a disc of radius 0.22 m
+POINT_SPACING = 0.08  # of the points that are used [m]
+MAX_NORMALS = 40_000  # that get a normal: a plane of 1 % of the cloud still has 400
+NUM_PLANE_NEIGHBORS = 24  # with the point itself: at 8 cm a disc of radius 0.22 m
 MIN_FRACTION = 0.01  # of all points, of a dominant plane
 NUM_HYPOTHESES = 200  # for each plane: one lies on a plane of 2 % of the points in 98 % of draws
-TOLERANCE = 0.03  # of an inlier, from the plane: six times a scanner's noise of 5 mm [m]
+PLANE_TOLERANCE = 0.03  # of an inlier, from the plane: six times a scanner's noise of 5 mm [m]
 INLIER_ANGLE = np.radians(15.0)  # of its normal, loose since normals near edges lean
 MAX_LEAN = np.radians(15.0)  # of the vertical to a direction that is said to be up
 AGREE_ANGLE = np.radians(3.0)  # of a plane to level or upright, that counts for the vertical
 MIN_ALIGNED = 0.6  # fraction of the planes' area that is level or upright: roofs are neither
 LEVEL_ANGLE = np.radians(8.0)  # of a level surface's normal to the vertical: ramps up to 1 : 7 are floors
-HEADROOM = 1.9  # of a person [m]
+PERSON_HEIGHT = 1.9  # of a person [m]
 FURNITURE = 0.3, 1.2  # heights of seats, tables, counters, shelves above the floor [m]
-STEP = 0.3  # what is lower does not keep anybody from walking [m]
-CELL = 0.25  # of the grid in which people walk [m], or larger in wide scans
-REACH = 2  # cells between the points of a floor, or between free space and the next thing over a floor
-FEW_CELLS = 20.0  # added to both counts of a ratio, so that a handful says little
+WALKABLE_STEP = 0.3  # what is lower does not keep anybody from walking [m]
+WALKING_CELL = 0.25  # of the grid in which people walk [m], or larger in wide scans
+FLOOR_REACH = 2  # cells between the points of a floor, or between free space and the next thing over a floor
+ADDED_CELLS = 20.0  # added to both counts of a ratio, so that a handful says little
 
 
 class PointNormals(NamedTuple):
@@ -57,8 +57,8 @@ def estimate_normals(points: Array32) -> PointNormals:
     """Return normals of an evenly strided sample of a cloud (N, 3) [m], by PCA of the nearest points."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who asks for up waits for it
 
-    sample = points[:: -(-len(points) // MAX_POINTS)].astype(np.float64)
-    nearest = list(range(1, min(NUM_NEIGHBORS, len(points)) + 1))
+    sample = points[:: -(-len(points) // MAX_NORMALS)].astype(np.float64)
+    nearest = list(range(1, min(NUM_PLANE_NEIGHBORS, len(points)) + 1))
     neighbors = points[cKDTree(points).query(sample, nearest)[1]].astype(np.float64)
     neighbors -= neighbors.mean(axis=1, keepdims=True)
     variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", neighbors, neighbors))
@@ -100,7 +100,7 @@ def _are_inliers(cloud: PointNormals, some: Int64s, normals: Array, points: Arra
     offsets = np.einsum("hi,hi->h", normals, points)[:, None]
     distances = np.einsum("hi,ji->hj", normals, cloud.points[some]) - offsets
     cosines = np.einsum("hi,ji->hj", normals, cloud.normals[some])
-    return np.asarray((np.abs(distances) < TOLERANCE) & (np.abs(cosines) > np.cos(INLIER_ANGLE)))
+    return np.asarray((np.abs(distances) < PLANE_TOLERANCE) & (np.abs(cosines) > np.cos(INLIER_ANGLE)))
 
 
 def find_up(octree: Octree) -> tuple[Array, float, str, Planes]:
@@ -108,7 +108,7 @@ def find_up(octree: Octree) -> tuple[Array, float, str, Planes]:
 
     The vertical is square to the largest area, and along it the scan is lower than it is wide.
     """
-    cloud = estimate_normals(octree.level(SPACING)[:, :3])
+    cloud = estimate_normals(octree.level(POINT_SPACING)[:, :3])
     planes = ransac_planes(cloud)
     if not len(planes.areas):
         return np.array([0.0, 0.0, 1.0]), 0.0, "there are no dominant planes", planes
@@ -166,7 +166,7 @@ def wall_yaw(planes: Planes, R_level_from_scan: Array) -> float | None:
 
 def find_yaw_of_walls(octree: Octree) -> float | None:
     """Return `wall_yaw` of the octree of a cloud whose z is up."""
-    return wall_yaw(ransac_planes(estimate_normals(octree.level(SPACING)[:, :3])), np.eye(3))
+    return wall_yaw(ransac_planes(estimate_normals(octree.level(POINT_SPACING)[:, :3])), np.eye(3))
 
 
 def find_sense(
@@ -195,7 +195,7 @@ def find_levels(planes: Planes, axis: Array) -> Array:
     levels: list[float] = []
     for height, area in zip(dot(planes.centers, axis)[is_level], planes.areas[is_level], strict=True):
         is_large = area > 0.3 * planes.areas[is_level][0]  # tables have less
-        if is_large and all(abs(height - other) > HEADROOM for other in levels):
+        if is_large and all(abs(height - other) > PERSON_HEIGHT for other in levels):
             levels.append(float(height))
     return np.array(sorted(levels))
 
@@ -206,7 +206,7 @@ def furniture_cue(heights: Array, is_level: Mask, levels: Array) -> float:
     above = heights[is_level] - np.append(-np.inf, levels)[next_level]
     below = np.append(levels, np.inf)[next_level] - heights[is_level]
     low, high = FURNITURE
-    few = 0.001 * len(heights)  # as FEW_CELLS
+    few = 0.001 * len(heights)  # as ADDED_CELLS
     standing = np.count_nonzero((above > low) & (above < np.minimum(high, below)))
     hanging = np.count_nonzero((below > low) & (below < np.minimum(high, above)))
     return float(np.log((standing + few) / (hanging + few)))
@@ -220,19 +220,21 @@ def passage_cue(heights: Array, is_level: Mask, levels: Array, places: Array) ->
     from scipy import ndimage  # noqa: PLC0415  # only who asks for up waits for it
 
     low, high = np.quantile(places, [0.001, 0.999], axis=0)
-    cell = max(CELL, float(np.sqrt(np.prod(high - low) / 4e6)))
+    cell = max(WALKING_CELL, float(np.sqrt(np.prod(high - low) / 4e6)))
     edges = [np.arange(a, b + cell, cell) for a, b in zip(low, high, strict=True)]
 
     def grid(mask: Mask) -> Mask:
         return np.asarray(np.histogramdd(places[mask], edges)[0] > 0)
 
-    pieces = np.full((2, 2), FEW_CELLS)  # above, below: free cells times their piece's fraction; free cells
+    pieces = np.full((2, 2), ADDED_CELLS)  # above, below: free cells times their piece's fraction; free cells
     for level in levels:
-        sheet = np.pad(grid(is_level & (np.abs(heights - level) < 0.12)), REACH)
-        sheet = ndimage.binary_closing(sheet, iterations=REACH)[REACH:-REACH, REACH:-REACH]
+        sheet = np.pad(grid(is_level & (np.abs(heights - level) < 0.12)), FLOOR_REACH)
+        sheet = ndimage.binary_closing(sheet, iterations=FLOOR_REACH)[
+            FLOOR_REACH:-FLOOR_REACH, FLOOR_REACH:-FLOOR_REACH
+        ]
         for k, off in enumerate((heights - level, level - heights)):
-            is_free = sheet & ~grid((off > STEP) & (off < HEADROOM))
-            is_free &= ndimage.binary_dilation(grid(off > STEP), iterations=REACH)
+            is_free = sheet & ~grid((off > WALKABLE_STEP) & (off < PERSON_HEIGHT))
+            is_free &= ndimage.binary_dilation(grid(off > WALKABLE_STEP), iterations=FLOOR_REACH)
             areas = np.bincount(ndimage.label(is_free)[0].ravel())[1:]
             areas = areas[areas > 8]  # cells of one piece
             pieces[k] += (areas**2).sum() / max(areas.sum(), 1), areas.sum()

@@ -25,7 +25,7 @@ from ..errors import InputError
 from .memory import share_arenas
 
 ATTEMPTS = 2  # to work on an item, or to open
-OPENING = 10.0  # times the seconds of an item may be spent on opening
+MOST_OPENING = 10.0  # times the seconds of an item may be spent on opening
 IN_FLIGHT = 4  # items a process, so that none waits for a slow one before
 PARENT_LOST = 1  # exit code
 # Not fork: the child would have the threads of this process stand still in the middle of their work.
@@ -192,7 +192,7 @@ class Processes:
                 (child,) = pool._processes.values()
                 self._children.append(child)
             try:
-                opened.result(self.seconds and OPENING * self.seconds)
+                opened.result(self.seconds and MOST_OPENING * self.seconds)
             except BrokenProcessPool:
                 end = self._end_of(pool, child)
                 continue

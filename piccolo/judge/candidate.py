@@ -9,7 +9,7 @@ import numpy as np
 from ..arrays import Array, Mask
 from ..geometry.pose import Pose
 from ..local_features.matching import Matches
-from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
+from ..optimize.channel_loss import CHANCE_CORRELATION, NUM_BLOCKS
 from ..problem.photo_images import PhotoImages
 from .reasons import Contradiction
 
@@ -29,7 +29,7 @@ class Comparison(NamedTuple):
     @property
     def score(self) -> float:
         """Area explained beyond chance, divided by the area that the photo shows, in [0, 1]."""
-        return self.score_beyond(CHANCE)
+        return self.score_beyond(CHANCE_CORRELATION)
 
     def score_beyond(self, chance: float) -> float:
         """Return the score where chance explains as much of a block as `chance`."""
@@ -50,7 +50,7 @@ class Comparison(NamedTuple):
         shared = np.minimum(self.visible_area, other.visible_area)
         if shared.sum() < LEAST_SHARED * min(self.visible_area.sum(), other.visible_area.sum()):
             return 0.0
-        mine, others = (np.maximum(c.correlation - CHANCE, 0.0) @ shared for c in (self, other))
+        mine, others = (np.maximum(c.correlation - CHANCE_CORRELATION, 0.0) @ shared for c in (self, other))
         return float(mine / max(others, 1e-9))
 
 
@@ -120,4 +120,4 @@ class Selection:
         return self.take([candidate.forget() for candidate in self.candidates])
 
 
-NOTHING = Selection(NO_CANDIDATE, ())
+NO_CHOICE = Selection(NO_CANDIDATE, ())

@@ -12,7 +12,7 @@ WRONG_SHARE = 0.02  # chosen: of given focal lengths, those that are wrong
 WRONG_DEVIATION = 0.1  # chosen: deviation of the logarithm of a wrong one
 MOST_LOG = 20.0  # of odds
 MOST_CONFLICT = 4.0  # deviations between the focal length found and that given: more contradict it
-LEAST_PHOTOS = 3  # that make a consensus
+LEAST_AGREEING_PHOTOS = 3  # that make a consensus
 OUTLYING = 3.0  # deviations, the scale of weights: photos that differ more have less than a quarter
 SHARED_DEVIATION = 0.003  # of an error that all photos of a camera share, as that of a calibration
 NUM_UPDATES = 20  # of the weights
@@ -64,7 +64,7 @@ class Consensus:
             self._weights = self._precision * geman_mcclure(square, OUTLYING**-2)[1]
             middle = self._weights @ self._off / self._weights.sum()
 
-    def opinion(self, without: int | None = None, least: int = LEAST_PHOTOS) -> Opinion | None:
+    def opinion(self, without: int | None = None, least: int = LEAST_AGREEING_PHOTOS) -> Opinion | None:
         """Return the opinion of all, or of all without one; None of fewer than `least`."""
         weights = self._weights.copy()
         if without is not None:

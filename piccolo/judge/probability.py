@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array
+from ..problem.method import METHOD, Method
 from ..problem.profile import EvidenceKind
 
 LOCALIZED = "localized"
@@ -34,12 +35,10 @@ class ChoiceModel(NamedTuple):
 
 LEAST_STD = 0.003  # [m] deviations below this are taken for it
 MOST_STD = 0.3  # [m] and those above this
-LEAST_SCORE = 0.02
+LEAST_LOGIT_SCORE = 0.02
 LEAST_DRAWN = 0.01
-LEAST_RATIO = 0.1
 MOST_RATIO = 1.2
-CONTRADICTED = 0.01  # odds that what the user says is wrong
-NOISE_MATCHES = 8  # added to the number that agree, as so many may by chance
+CONTRADICTED_ODDS = 0.01  # odds that what the user says is wrong
 # By tools/benchmark.py calibration. Each feature counts in one direction only.
 FEATURES = ("log of the ratio", "log of the score", "log of the matches, or of the drawn score")
 NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")
@@ -50,21 +49,21 @@ MODELS: dict[EvidenceKind, ChoiceModel] = {
 }
 
 
-def pose_features(standing: Standing) -> Array:
+def pose_features(standing: Standing, method: Method = METHOD) -> Array:
     """Return the features of a pose's odds, as FEATURES names them; by coloured views alone the first two."""
-    ratio = min(max(standing.ratio, LEAST_RATIO), MOST_RATIO)
-    of_views = [ratio, max(standing.score, LEAST_SCORE)]
+    ratio = min(max(standing.ratio, method.least_ratio), MOST_RATIO)
+    of_views = [ratio, max(standing.score, LEAST_LOGIT_SCORE)]
     if standing.drawn_score is not None:
         return np.log([*of_views, max(standing.drawn_score, LEAST_DRAWN)])
     if standing.num_matches is None:
         return np.log(of_views)
-    return np.log([*of_views, standing.num_matches + NOISE_MATCHES])
+    return np.log([*of_views, standing.num_matches + method.noise_matches])
 
 
-def log_odds(standing: Standing, model: ChoiceModel | None = None) -> float:
+def log_odds(standing: Standing, method: Method = METHOD, model: ChoiceModel | None = None) -> float:
     """Return the logarithm of a pose's odds, up to a constant; by default with the model of its evidence."""
     model = model or MODELS[standing.evidence]
-    return float(pose_features(standing) @ np.array(model.weights)) + standing.log_prior
+    return float(pose_features(standing, method) @ np.array(model.weights)) + standing.log_prior
 
 
 def none_features(std: float | None) -> Array:
@@ -76,7 +75,10 @@ def none_features(std: float | None) -> Array:
 
 
 def posterior(
-    standings: Sequence[Standing], std_of_fit: float | None, model: ChoiceModel | None = None
+    standings: Sequence[Standing],
+    std_of_fit: float | None,
+    method: Method = METHOD,
+    model: ChoiceModel | None = None,
 ) -> Array:
     """Return the probabilities (K + 1,) that the place of each of K poses is right, and that none of them is.
 
@@ -85,7 +87,7 @@ def posterior(
     is right is more likely if the best pose's deviation makes 0.1 m doubtful.
     """
     model = model or MODELS[standings[0].evidence]
-    logits = [log_odds(standing, model) for standing in standings]
+    logits = [log_odds(standing, method, model) for standing in standings]
     of_none = none_features(std_of_fit)
     logits.append(float(of_none @ np.array(model.none_weights)))
     odds = np.exp(np.array(logits) - max(logits))

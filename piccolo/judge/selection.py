@@ -6,24 +6,17 @@ from itertools import compress
 
 import numpy as np
 
+from ..problem.method import Method
 from ..problem.profile import Profile
 from .alternatives import alternative_poses, sort_by_score
-from .candidate import MAX_COMPARED, NOTHING, Candidate, Selection
-from .probability import CONTRADICTED, Standing, log_odds
-from .sure import SURE_ODDS
-
-FAINT_SCORE = 0.1  # a pose with less ends no search: the scan is not drawn to see whether it is sure
-CLEAR_MARGIN = 0.5  # least margin by whole views
-CHANCE_MATCHES = 6  # may agree with a wrong pose, mostly none do
-SURE_MATCHES = 12  # of a right pose; wrong ones have about 5, in repeated places more, but then several do
-MIRROR_RATIO = 1.05  # least ratio of scores, mirrored photo to photo
-RIVAL_SCORE = 0.5  # least score of a pose that could win against a sure one, as a fraction of that one's
+from .candidate import MAX_COMPARED, NO_CHOICE, Candidate, Selection
+from .probability import CONTRADICTED_ODDS, Standing, log_odds
 
 
 def rank(candidates: Sequence[Candidate]) -> Selection:
-    """Return the best candidate by score, and at most MAX_COMPARED elsewhere; NOTHING if there are none."""
+    """Return the best candidate by score, and at most MAX_COMPARED elsewhere; NO_CHOICE if there are none."""
     if not candidates:
-        return NOTHING
+        return NO_CHOICE
     best = sort_by_score(candidates)[0]
     return Selection(best, tuple(alternative_poses(best, candidates, count=MAX_COMPARED)))
 
@@ -37,8 +30,8 @@ def list_drawn(profile: Profile, ranked: Sequence[Candidate]) -> list[bool]:
     if not profile.uses_matches:
         return [False] * len(ranked)
     best, *others = ranked
-    is_sure = (best.num_matches or 0) >= SURE_MATCHES
-    could_win = [not is_sure or h.score >= RIVAL_SCORE * best.score for h in others]
+    is_sure = (best.num_matches or 0) >= profile.method.sure_matches
+    could_win = [not is_sure or h.score >= profile.method.rival_score * best.score for h in others]
     if profile.most_rivals is not None:
         allowed = list(np.cumsum(could_win) <= profile.most_rivals)
         could_win = [could and bool(allows) for could, allows in zip(could_win, allowed, strict=True)]
@@ -57,7 +50,7 @@ def assess_alone(profile: Profile, ranked: Sequence[Candidate]) -> list[Standing
     Poses that contradict the prior share the odds that the prior is wrong.
     """
     is_wrong = [bool(h.against_prior) for h in ranked]
-    log_prior = math.log(CONTRADICTED / max(sum(is_wrong), 1))
+    log_prior = math.log(CONTRADICTED_ODDS / max(sum(is_wrong), 1))
     counts = count_matches(profile, ranked)
     standings = []
     for h, wrong, count in zip(ranked, is_wrong, counts, strict=True):
@@ -84,11 +77,12 @@ def select(profile: Profile, found: Selection) -> Selection:
     """
     if not found.alternatives:
         return found
+    method = profile.method
     ranked = found.candidates
     alone = assess_alone(profile, ranked)
     ratios = [[other.seen.compute_ratio(one.seen) for other in ranked] for one in ranked]
     odds = np.array(
-        [[log_odds(a._replace(ratio=v)) for a, v in zip(alone, row, strict=True)] for row in ratios]
+        [[log_odds(a._replace(ratio=v), method) for a, v in zip(alone, row, strict=True)] for row in ratios]
     )
     odds -= np.diag(odds)[:, None].copy()  # of the pose of each column against that of each row
     worst = np.where(np.eye(len(ranked), dtype=bool), -np.inf, odds).max(axis=1)
@@ -100,32 +94,34 @@ def select(profile: Profile, found: Selection) -> Selection:
 
 def is_sure(profile: Profile, found: Selection) -> bool:
     """Return True if the matches of the selected candidate and its odds against the others end the search."""
+    method = profile.method
     best, *others = assess(profile, found)
-    if (best.num_matches or 0) < SURE_MATCHES:
+    if (best.num_matches or 0) < method.sure_matches:
         return False
-    return all(log_odds(best) - log_odds(other) >= SURE_ODDS for other in others)
+    odds = log_odds(best, method)
+    return all(odds - log_odds(other, method) >= method.sure_odds for other in others)
 
 
 def is_clear(profile: Profile, found: Selection) -> bool:
     """Return True if one candidate alone explains a whole photo."""
-    return found.best.score >= profile.clear_score and found.margin >= CLEAR_MARGIN
+    return found.best.score >= profile.clear_score and found.margin >= profile.method.clear_margin
 
 
 def is_faint(profile: Profile, found: Selection) -> bool:
     """Return True if all are faint and no more features agree than by chance: refinement soon ends."""
-    if max(h.score for h in found.candidates) >= FAINT_SCORE:
+    if max(h.score for h in found.candidates) >= profile.method.faint_score:
         return False
-    return max(count_matches(profile, found.candidates)) <= CHANCE_MATCHES
+    return max(count_matches(profile, found.candidates)) <= profile.method.chance_matches
 
 
-def explains_more(mirrored: Candidate, own: Candidate) -> bool:
+def explains_more(method: Method, mirrored: Candidate, own: Candidate) -> bool:
     """Return True if a mirrored photo explains more; in a symmetric scene both are about equal."""
-    return mirrored.score > MIRROR_RATIO * own.score
+    return mirrored.score > method.mirror_ratio * own.score
 
 
-def is_mirrored(own: Candidate, mirrored: Candidate | None) -> bool:
+def is_mirrored(method: Method, own: Candidate, mirrored: Candidate | None) -> bool:
     """Return True if a photo fits better mirrored: a pose explains more, and more features agree with it."""
-    if mirrored is None or not explains_more(mirrored, own):
+    if mirrored is None or not explains_more(method, mirrored, own):
         return False
     return (mirrored.num_matches or 0) > (own.num_matches or 0)
 

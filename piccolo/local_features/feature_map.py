@@ -18,7 +18,7 @@ from .keypoints import DESCRIPTOR_SIZE, find_keypoints
 from .perspective_view import cover_sphere
 from .view_image import render_gray
 
-VIEW_WIDTH = 640  # [px] of the views
+MAP_VIEW_WIDTH = 640  # [px] of the views
 NUM_COMPONENTS = 64
 MAX_RANGE = 30.0  # [m] farther away the scan is too thin, and a match hardly constrains the position
 SAMPLE = 20_000  # descriptors from which the components and the lists' middles are learnt
@@ -27,17 +27,17 @@ MAX_LISTS = 4096
 MOST_VIEWS = 1 << 16
 GROWTH = 2  # of the number of lists for all features: from this factor on new lists are made
 KMEANS_ROUNDS = 5
-BLOCK = 4096  # descriptors that are projected, or that a thread sorts into lists, at a time
-AT_ONCE = 256  # of these, whose distances from all lists' middles take 4 MB
+DESCRIPTORS_AT_ONCE = 4096  # descriptors that are projected, or that a thread sorts into lists, at a time
+FEATURES_AT_ONCE = 256  # of these, whose distances from all lists' middles take 4 MB
 # From where features are taken: few positions that see all that a camera can see
-SPACING = 2.5  # [m] across: a nearer place that is seen from a position needs none
+VIEW_SPACING = 2.5  # [m] across: a nearer place that is seen from a position needs none
 LAYER = 2.4  # [m] in height
 MAX_VIEWS = 2500  # some minutes and 0.4 GB
-WIDER = 1.5  # growth of the spacing where there would be more
+SPACING_GROWTH = 1.5  # growth of the spacing where there would be more
 ABOVE_LOWEST = 1.0  # [m] first are positions so high above the lowest around
 HEIGHT_STEP = 0.3  # [m]
 Look = Callable[[int], Array32]  # ranges (cells,) [m] seen from a candidate, 0 for nothing
-CELL = np.array([2.5, 2.5, 3.0])  # [m] around: a part of a storey
+STOREY_CELL = np.array([2.5, 2.5, 3.0])  # [m] around: a part of a storey
 TABLE_HEIGHT = 48  # rows of directions, 3.75 degrees each
 SLACK = 1.0  # [m] a wall is so much nearer than what is behind it
 
@@ -68,11 +68,11 @@ class FeaturesOfView(NamedTuple):
     descriptors: Bytes
 
 
-_ROWS = np.empty((0, 3), np.int8)
+_NO_ROWS = np.empty((0, 3), np.int8)
 NO_FEATURES = FeaturesOfView(
     np.empty((0, 3), np.float32),
-    _ROWS,
-    _ROWS,
+    _NO_ROWS,
+    _NO_ROWS,
     np.empty(0, np.float32),
     np.empty((0, DESCRIPTOR_SIZE), np.uint8),
 )
@@ -80,10 +80,10 @@ NO_FEATURES = FeaturesOfView(
 
 def extract_view_features(octree: Octree, center_map: Array) -> FeaturesOfView:
     """Find the features seen from a centre (3,) [m] whose ray meets the scan within MAX_RANGE."""
-    is_drawn = np.ones((VIEW_WIDTH // 2, VIEW_WIDTH), np.bool_)
+    is_drawn = np.ones((MAP_VIEW_WIDTH // 2, MAP_VIEW_WIDTH), np.bool_)
     image = render_gray(octree, Pose(np.eye(3), center_map), is_drawn)
-    found = find_keypoints(image.gray, image.is_filled, cover_sphere(VIEW_WIDTH))
-    ranges = image.ranges[compute_indices(found.rays, VIEW_WIDTH)]
+    found = find_keypoints(image.gray, image.is_filled, cover_sphere(MAP_VIEW_WIDTH))
+    ranges = image.ranges[compute_indices(found.rays, MAP_VIEW_WIDTH)]
     kept = np.flatnonzero((ranges > 0.0) & (ranges < MAX_RANGE))
     found = found.take(kept)
     ranges = ranges[kept]
@@ -112,10 +112,10 @@ def project(descriptors: Bytes, mean: NDArray[np.int16], components: Int8s) -> I
     Sums of whole numbers below 2^24 are exact in float32.
     """
     projected = np.empty((len(descriptors), NUM_COMPONENTS), np.int8)
-    for lo in range(0, len(descriptors), BLOCK):
-        values = descriptors[lo : lo + BLOCK].astype(np.float32) - mean.astype(np.float32)
+    for lo in range(0, len(descriptors), DESCRIPTORS_AT_ONCE):
+        values = descriptors[lo : lo + DESCRIPTORS_AT_ONCE].astype(np.float32) - mean.astype(np.float32)
         sums = values @ components.astype(np.float32)
-        projected[lo : lo + BLOCK] = np.clip(np.rint(sums / np.float32(127.0)), -127, 127)
+        projected[lo : lo + DESCRIPTORS_AT_ONCE] = np.clip(np.rint(sums / np.float32(127.0)), -127, 127)
     return projected
 
 
@@ -141,10 +141,10 @@ def find_nearest(descriptors: Int8s, middles: Int8s) -> Int32s:
     values = middles.astype(np.float32)
     squares = np.sum(values * values, axis=1)
     values *= np.float32(-2.0)
-    for lo in range(0, len(descriptors), AT_ONCE):
-        gaps = descriptors[lo : lo + AT_ONCE].astype(np.float32) @ values.T
+    for lo in range(0, len(descriptors), FEATURES_AT_ONCE):
+        gaps = descriptors[lo : lo + FEATURES_AT_ONCE].astype(np.float32) @ values.T
         gaps += squares
-        nearest[lo : lo + AT_ONCE] = gaps.argmin(axis=1)
+        nearest[lo : lo + FEATURES_AT_ONCE] = gaps.argmin(axis=1)
     return nearest
 
 
@@ -189,7 +189,9 @@ def put_in_lists(
     `of_points` are the first six arrays of FeatureMap, in any order of the features, `of_all` its next three.
     """
     descriptors = of_points[4]
-    parts = [descriptors[lo : lo + BLOCK] for lo in range(0, len(descriptors), BLOCK)]
+    parts = [
+        descriptors[lo : lo + DESCRIPTORS_AT_ONCE] for lo in range(0, len(descriptors), DESCRIPTORS_AT_ONCE)
+    ]
     with one_blas_thread():
         found = workers.map(lambda part: find_nearest(part, middles), parts, "sort features")
     nearest = np.concatenate([np.empty(0, np.int32), *found])
@@ -276,16 +278,16 @@ def view_positions(centers: Array, look: Look, num_rings: int, num_known: int = 
     """
     if len(centers) == 0:
         return np.empty(0, np.int64)
-    _, group = np.unique(np.floor(centers / CELL), axis=0, return_inverse=True)
+    _, group = np.unique(np.floor(centers / STOREY_CELL), axis=0, return_inverse=True)
     lowest = np.full(group.max() + 1, np.inf)
     np.minimum.at(lowest, group.ravel(), centers[:, 2])
     off = np.abs(centers[:, 2] - lowest[group.ravel()] - ABOVE_LOWEST)
     order = np.argsort(np.rint(off / HEIGHT_STEP), kind="stable")
     order = order[order >= num_known]
     look = lru_cache(maxsize=None)(look)
-    cells, spacing = cell_table(num_rings), SPACING
+    cells, spacing = cell_table(num_rings), VIEW_SPACING
     while (kept := choose(order, centers, num_known, look, cells, spacing)) is None:
-        spacing *= WIDER
+        spacing *= SPACING_GROWTH
     return kept
 
 

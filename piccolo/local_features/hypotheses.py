@@ -21,7 +21,7 @@ from ..geometry.vectors import cross, dot, minus, rotate, row
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, Scalar, inline_kernel, kernel
 from ..optimize.levenberg_marquardt import levenberg_marquardt
-from ..optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX
+from ..optimize.normal_equations import COUNT_SUM, GRADIENT, LOSS, MATRIX
 from .matching import Matches
 from .p3p import p3p
 
@@ -31,10 +31,10 @@ COS_TANGENT = math.cos(math.radians(40.0))
 SIZE_RATIO = 1.7  # of a keypoint's size as predicted and as found, at most
 LEAST_ANGLE = np.float32(1e-6)  # [rad] of a keypoint
 MAX_VOTERS = 1200  # single matches whose poses are tried
-BATCH = 64  # of them a thread tries at a time
+TRIPLES_A_TASK = 64  # of them a thread tries at a time
 NUM_CLUSTERS = 48  # that are made exact, at most
 FAIR_PART = 0.2  # of the best pose's matches
-NUM_SAMPLES = 200  # of three matches, a cluster
+NUM_TRIPLES = 200  # of three matches, a cluster
 LEAST_MATCHES = 4  # that agree with a pose
 REFINEMENTS = 8  # steps
 REFINE_SCALE = math.radians(0.5)  # [rad] of the loss
@@ -72,7 +72,7 @@ def angular_equations(
         square = (x - bx) ** 2 + (y - by) ** 2 + (z - bz) ** 2
         loss, w = inline_geman_mcclure(square, inverse_scale2)
         sums[LOSS] += loss
-        sums[COUNT] += 1.0
+        sums[COUNT_SUM] += 1.0
         v = w * inverse
         along = x * bx + y * by + z * bz
         gradient = (
@@ -176,7 +176,7 @@ def count_exact(
 
 @kernel
 def sample_poses(columns: Array32, rotations: Array, centers: Array) -> int:
-    """Write poses (n, 3, 3), (n, 3) of three matches each, at most 4 NUM_SAMPLES; return their number.
+    """Write poses (n, 3, 3), (n, 3) of three matches each, at most 4 NUM_TRIPLES; return their number.
 
     `columns` (6, m) are points and rays of the matches. The samples are the same in every run.
     """
@@ -184,7 +184,7 @@ def sample_poses(columns: Array32, rotations: Array, centers: Array) -> int:
     bearings = np.empty((3, 3))
     points = np.empty((3, 3))
     state = np.uint32(12345)
-    for _ in range(NUM_SAMPLES):
+    for _ in range(NUM_TRIPLES):
         for i in range(3):
             state = np.uint32(state * np.uint32(1664525) + np.uint32(1013904223))
             drawn = np.int64(state >> np.uint32(8)) % columns.shape[1]
@@ -225,8 +225,8 @@ def exact_pose(matches: Matches, rough: Pose) -> MatchedPose | None:
     if len(members) < LEAST_MATCHES:
         return None
     columns = np.ascontiguousarray(np.hstack([matches.points[members], matches.rays[members]]).T)
-    rotations = np.empty((4 * NUM_SAMPLES, 3, 3))
-    centers = np.empty((4 * NUM_SAMPLES, 3))
+    rotations = np.empty((4 * NUM_TRIPLES, 3, 3))
+    centers = np.empty((4 * NUM_TRIPLES, 3))
     counts = np.empty(sample_poses(columns, rotations, centers), np.int64)
     count_exact(matches, members, rotations, centers, counts)
     if max(counts, default=0) < LEAST_MATCHES:
@@ -254,10 +254,10 @@ def propose_poses(matches: Matches, count: int, workers: Workers) -> list[Matche
     votes = np.empty(len(voters))
 
     def vote(lo: int) -> None:
-        part = slice(lo, lo + BATCH)
+        part = slice(lo, lo + TRIPLES_A_TASK)
         rough_poses(matches, voters[part], rotations[part], centers[part], votes[part])
 
-    list(workers.map(vote, range(0, len(voters), BATCH), "vote"))
+    list(workers.map(vote, range(0, len(voters), TRIPLES_A_TASK), "vote"))
     order = np.argsort(-votes, kind="stable")
     kept = order[non_maximum_suppression(rotations[order], centers[order], NUM_CLUSTERS, VOTED)]
     rough = [Pose(rotations[k], centers[k]) for k in kept]

@@ -14,10 +14,10 @@ from ..kernels.jit import inline_kernel, kernel
 from .feature_map import FeatureMap, project, square_gap
 from .keypoints import Keypoints
 
-NUM_NEIGHBORS = 4  # features of the map that a feature of the photo is matched to, at most
+NUM_MATCHED_FEATURES = 4  # features of the map that a feature of the photo is matched to, at most
 NUM_LISTS = 16  # that are searched
 APART = np.float32(0.3)  # [m] features of the map nearer to each other are one
-BATCH = 64  # features a thread takes at a time
+FEATURES_A_TASK = 64  # features a thread takes at a time
 # of the best distance to the best elsewhere, at most, of a distinct match (Lowe, "Distinctive Image Features
 # from Scale-Invariant Keypoints", 2004)
 DISTINCT_RATIO = 0.8
@@ -25,8 +25,8 @@ DISTINCT_RATIO = 0.8
 # phone photos were localized in place of 36, and 42 right in place of 43.
 DISTINCT_IN_MAP = math.sqrt(0.8)
 COS_ELSEWHERE = np.float32(math.cos(math.radians(2.0)))  # of what another picture shows
-LEAST_WEIGHT = 0.5
-FAR = np.int32(2147483647)
+LEAST_MATCH_WEIGHT = 0.5
+FARTHEST_DISTANCE = np.int32(2147483647)
 
 
 class Matches(NamedTuple):
@@ -40,7 +40,7 @@ class Matches(NamedTuple):
     directions: Array32  # (M, 3) from which the map knows it, camera to point
     tangents: Array32  # (M, 3)
     sizes: Array32  # (M,) diameter [m]
-    weights: Array32  # (M,) 1 of a distinct one, else LEAST_WEIGHT
+    weights: Array32  # (M,) 1 of a distinct one, else LEAST_MATCH_WEIGHT
 
     def take(self, kept: NDArray[np.integer] | Mask) -> "Matches":
         """Return the matches at indices, or of a mask (M,)."""
@@ -92,11 +92,12 @@ def search_lists(
 ) -> None:
     """Write the nearest features (N, K) of the map, of one place only the nearest, and squared distances.
 
-    `probes` (N, P) are the lists to search; -1 and FAR are written where there are fewer features. A nearer
-    feature replaces only the first kept one that is close to it: of several in a row, two may stay.
+    `probes` (N, P) are the lists to search; -1 and FARTHEST_DISTANCE are written where there are fewer
+    features. A nearer feature replaces only the first kept one that is close to it: of several in a row, two
+    may stay.
     """
     found[:] = -1
-    distances[:] = FAR
+    distances[:] = FARTHEST_DISTANCE
     for i in range(len(descriptors)):
         for p in range(probes.shape[1]):
             for f in range(list_start[probes[i, p]], list_start[probes[i, p] + 1]):
@@ -113,7 +114,7 @@ def nearest_lists(descriptors: Int8s, middles: Int8s, probes: Int32s) -> None:
     """Write the indices (N, P) of the middles nearest to each descriptor, nearest first."""
     best = np.empty(probes.shape[1], np.int32)
     for i in range(len(descriptors)):
-        best[:] = FAR
+        best[:] = FARTHEST_DISTANCE
         for m in range(len(middles)):
             total = square_gap(descriptors[i], middles[m])
             if total < best[-1]:
@@ -132,22 +133,22 @@ def match(keypoints: Keypoints, feature_map: FeatureMap, workers: Workers) -> Ma
     """Match a photo's keypoints to the map's features, each to the best few."""
     m = feature_map
     descriptors = project(keypoints.descriptors, m.mean, m.components)
-    found = np.empty((len(descriptors), NUM_NEIGHBORS + 1), np.int32)
+    found = np.empty((len(descriptors), NUM_MATCHED_FEATURES + 1), np.int32)
     distances = np.empty(found.shape, np.int32)
     probes = np.empty((len(descriptors), min(NUM_LISTS, len(m.middles))), np.int32)
 
     def run(lo: int) -> None:
-        part = slice(lo, lo + BATCH)
+        part = slice(lo, lo + FEATURES_A_TASK)
         own = descriptors[part]
         lists = probes[part]
         nearest_lists(own, m.middles, lists)
         search_lists(own, lists, m.descriptors, m.list_start, m.points, found[part], distances[part])
 
-    list(workers.map(run, range(0, len(descriptors), BATCH), "match"))
-    query, rank = np.nonzero(found[:, :NUM_NEIGHBORS] >= 0)
+    list(workers.map(run, range(0, len(descriptors), FEATURES_A_TASK), "match"))
+    query, rank = np.nonzero(found[:, :NUM_MATCHED_FEATURES] >= 0)
     chosen = found[query, rank]
     is_sure = (rank == 0) & is_distinct(distances[query, 0], distances[query, 1], DISTINCT_IN_MAP)
-    weights = np.where(is_sure, 1.0, LEAST_WEIGHT).astype(np.float32)
+    weights = np.where(is_sure, 1.0, LEAST_MATCH_WEIGHT).astype(np.float32)
     return Matches(
         query.astype(np.int32),
         keypoints.rays[query],

@@ -19,7 +19,7 @@ from ..kernels.jit import Scalar, inline_kernel, kernel
 
 LEAST_SINE2 = 1e-10  # of the angles of the triangle of points: below, they lie on a line
 LEAST_GAP = 5e-13  # 1 - cosine of two bearings: below a microradian they are the same
-ROUNDING = 1e-9  # by which the sides of a solution may miss, relative
+SIDE_ROUNDING = 1e-9  # by which the sides of a solution may miss, relative
 POLISHING = 4  # Newton steps on the distances
 
 Cofactors = tuple[float, float, float, float, float, float]  # of a symmetric matrix: 00, 01, 02, 11, 12, 22
@@ -130,7 +130,7 @@ def split_conic(conic: Array, lines: Array) -> bool:
     if abs(a[5]) > abs(square):
         p = (a[2], a[4], a[5])
         square = a[5]
-    if not square < ROUNDING:
+    if not square < SIDE_ROUNDING:
         return False
     scale = 1.0 / math.sqrt(-square) if square < 0.0 else 0.0
     conic[0, 1] -= scale * p[2]
@@ -165,7 +165,7 @@ def meet(line: Array, conic: Array, ratios: Array) -> int:
     b = conic[i, j] + p * q * conic[k, k] + q * conic[i, k] + p * conic[j, k]
     c = conic[j, j] + q * (q * conic[k, k] + 2.0 * conic[j, k])
     discriminant = b * b - a * c
-    if not discriminant >= -ROUNDING * (b * b + abs(a * c)):
+    if not discriminant >= -SIDE_ROUNDING * (b * b + abs(a * c)):
         return 0
     s = -(b + math.copysign(math.sqrt(max(discriminant, 0.0)), b))
     for n in range(2):
@@ -205,7 +205,7 @@ def polish_distances(ratios: Array, cosines: Triple, sides2: tuple[Scalar, Scala
     ratios[0] = d0
     ratios[1] = d1
     ratios[2] = d2
-    is_fit: bool = abs(e0) + abs(e1) + abs(e2) < ROUNDING * (1.0 + d0 * d0 + d1 * d1 + d2 * d2)
+    is_fit: bool = abs(e0) + abs(e1) + abs(e2) < SIDE_ROUNDING * (1.0 + d0 * d0 + d1 * d1 + d2 * d2)
     return is_fit and d0 > 0.0 and d1 > 0.0 and d2 > 0.0
 
 

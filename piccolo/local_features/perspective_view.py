@@ -12,7 +12,7 @@ from ..arrays import Array, Array32, Bytes, Floats, Int64s, Mask
 from ..geometry.sphere import compute_pixels, pixel_rays
 
 FIELD_DEG = 65.0  # of a view of the set that covers the sphere, across
-MARGIN = 8  # [px] of the sphere's picture around it, so that views may cross the seam
+PICTURE_MARGIN = 8  # [px] of the sphere's picture around it, so that views may cross the seam
 # azimuth and elevation of the views' middles [deg]; at the poles pictures show floor and ceiling, or nothing
 VIEWS_DEG = [(45.0 * k, 0.0) for k in range(8)]
 VIEWS_DEG += [(60.0 * k + 30.0, elevation) for elevation in (45.0, -45.0) for k in range(6)]
@@ -22,7 +22,7 @@ Image = TypeVar("Image", Bytes, Mask)
 FACES_DEG = [*((90.0 * k, 0.0) for k in range(NUM_SIDES)), (0.0, 90.0), (0.0, -90.0)]
 HALVES = (0, 2, 4, 6, 8, 10, 12, 15, 17, 19), (1, 3, 5, 7, 9, 11, 13, 14, 16, 18)  # every other view
 STRETCH = 1.2  # tangent of the angle between the middle of a view around a photo and its edge, at most
-AROUND = 0.07  # [rad] that such a view shows more than the photo
+VIEW_AROUND = 0.07  # [rad] that such a view shows more than the photo
 MULTIPLE = 16  # [px] of the sides of such a view
 
 
@@ -76,7 +76,7 @@ def cover_sphere(width: int) -> list[PerspectiveView]:
 def list_sides(width: int) -> list[PerspectiveView]:
     """Return four views to the sides of a sphere's picture of `width`: faces of a cube, and a little more."""
     pixel = math.tau / width
-    side = math.ceil(2.0 * (1.0 + AROUND) / pixel / MULTIPLE) * MULTIPLE
+    side = math.ceil(2.0 * (1.0 + VIEW_AROUND) / pixel / MULTIPLE) * MULTIPLE
     return make_set(FACES_DEG, side, pixel, width)[:NUM_SIDES]
 
 
@@ -109,7 +109,7 @@ def view_around(is_valid: Mask, focal: float, width: int) -> PerspectiveView | N
     local = rays @ R_sphere_from_view
     if local[:, 0].min() <= 1.0 / math.hypot(1.0, STRETCH):
         return None
-    half_width, half_height = (np.abs(local[:, k] / local[:, 0]).max() + AROUND for k in (1, 2))
+    half_width, half_height = (np.abs(local[:, k] / local[:, 0]).max() + VIEW_AROUND for k in (1, 2))
     shape = tuple(math.ceil(2.0 * focal * half / MULTIPLE) * MULTIPLE for half in (half_height, half_width))
     return make_view(R_sphere_from_view, 1.0 / focal, (shape[0], shape[1]), width, middle[None], 0)
 
@@ -122,7 +122,7 @@ def make_view(
     centers = (0.5 * pixel * n * (1.0 - (2.0 * np.arange(n) + 1.0) / n) for n in reversed(shape))
     left, up = np.meshgrid(*centers)
     rays = np.stack([np.ones_like(left), left, up], axis=-1) @ R_sphere_from_view.T
-    columns, rows = (np.asarray(a - 0.5 + MARGIN, np.float32) for a in compute_pixels(rays, width))
+    columns, rows = (np.asarray(a - 0.5 + PICTURE_MARGIN, np.float32) for a in compute_pixels(rays, width))
     is_nearest = np.argmax(rays @ middles.T, axis=-1) == place
     grown = cv2.dilate(is_nearest.astype(np.uint8) * np.uint8(255), np.ones((5, 5), np.uint8))
     own = np.asarray(grown, np.uint8)
@@ -130,5 +130,9 @@ def make_view(
 
 
 def add_margin(image: Image) -> Image:
-    """Pad a picture or mask by MARGIN: columns wrap at the seam, the first and the last row are repeated."""
-    return np.pad(np.pad(image, ((0, 0), (MARGIN, MARGIN)), mode="wrap"), ((MARGIN, MARGIN), (0, 0)), "edge")
+    """Pad a picture or mask: columns wrap at the seam, the first and the last row are repeated."""
+    return np.pad(
+        np.pad(image, ((0, 0), (PICTURE_MARGIN, PICTURE_MARGIN)), mode="wrap"),
+        ((PICTURE_MARGIN, PICTURE_MARGIN), (0, 0)),
+        "edge",
+    )

@@ -15,18 +15,18 @@ from ..geometry.vectors import rotate
 from ..kernels.jit import F0, F1, HALF, Scalar, inline_kernel, kernel
 from ..views.view import Scratch, thread_scratch
 
-VOXEL_PER_RANGE = 1.0 / 80.0  # largest voxel, divided by its distance
-REACH = np.float32(0.7)  # half width of what is drawn for a voxel, divided by the voxel's width
+DRAWN_VOXEL_PER_RANGE = 1.0 / 80.0  # largest voxel, divided by its distance
+DRAWN_REACH = np.float32(0.7)  # half width of what is drawn for a voxel, divided by the voxel's width
 LEAST_REACH = np.float32(0.75)  # [px]
 MOST_REACH = np.float32(12.0)
 FRONT = np.float32(1.05)  # a pixel's grey is the mean up to this times its nearest range,
 FRONT_OFFSET = np.float32(0.05)  # [m] and this
-BEHIND = np.float32(1.2)  # a pixel all of whose surroundings are nearer by this factor is hidden
-WIDER = 4  # [px] of a wider pixel
+HIDDEN_BEHIND = np.float32(1.2)  # a pixel all of whose surroundings are nearer by this factor is hidden
+WIDER_PIXEL = 4  # [px] of a wider pixel
 FILL_LEVELS = 4  # gaps up to 16 px are filled
-LEAST_FILLED = 0.25  # of a wider pixel that fills finer ones
-NOTHING = np.float32(1e30)
-ROUNDING = 1e-3  # [rad] of a cone in float32
+LEAST_FILLED_PIXEL = 0.25  # of a wider pixel that fills finer ones
+NOTHING_NEAR = np.float32(1e30)
+CONE_ROUNDING = 1e-3  # [rad] of a cone in float32
 NEAREST = np.float32(0.1)  # cosine of the angle between a pinhole's axis and what it shows, at least
 
 
@@ -79,7 +79,7 @@ def project_voxels(
     pixels = scratch.directions
     up = scratch.ranges
     across = scratch.turns
-    count = collect(tree, center, VOXEL_PER_RANGE, cone, nodes, pixels)
+    count = collect(tree, center, DRAWN_VOXEL_PER_RANGE, cone, nodes, pixels)
     num = 0
     for k in range(count):
         x, y, z = rotate(R_cam_from_map, (pixels[0, k], pixels[1, k], pixels[2, k]))
@@ -92,7 +92,7 @@ def project_voxels(
             continue
         level = find_level(tree, nodes[k])
         size = np.float32(tree.leaf_size * 2.0 ** (len(tree.level_start) - 2 - level))
-        reach = REACH * size / max(r, np.float32(0.05)) * px_per_rad
+        reach = DRAWN_REACH * size / max(r, np.float32(0.05)) * px_per_rad
         up[num] = min(max(reach, LEAST_REACH), MOST_REACH)
         across[num] = min(up[num] * r / max(rho, np.float32(1e-3)), np.float32(0.25) * np.float32(width))
         pixels[0, num] = u
@@ -112,7 +112,7 @@ def draw_voxels(
     `scratch` holds `count` voxels from `project_voxels`. A picture that wraps continues at the other side.
     """
     height, width = ranges.shape
-    ranges[:] = NOTHING
+    ranges[:] = NOTHING_NEAR
     sums[:] = F0
     for is_second in range(2):
         for k in range(count):
@@ -152,17 +152,17 @@ def draw_voxels(
 def is_in_front(ranges: Array32, wraps: bool = True) -> Mask:
     """Return the mask (H, W) of the pixels that are not seen through a gap in a nearer surface.
 
-    `ranges` (H, W) are the nearest, NOTHING where there is none. A pixel is seen through a gap if every wider
-    pixel around it shows something much nearer.
+    `ranges` (H, W) are the nearest, NOTHING_NEAR where there is none. A pixel is seen through a gap if every
+    wider pixel around it shows something much nearer.
     """
-    nearest = ranges[::WIDER, ::WIDER].copy()
-    for i, j in np.ndindex(WIDER, WIDER):
-        np.minimum(nearest, ranges[i::WIDER, j::WIDER], out=nearest)
+    nearest = ranges[::WIDER_PIXEL, ::WIDER_PIXEL].copy()
+    for i, j in np.ndindex(WIDER_PIXEL, WIDER_PIXEL):
+        np.minimum(nearest, ranges[i::WIDER_PIXEL, j::WIDER_PIXEL], out=nearest)
     beside: Literal["wrap", "edge"] = "wrap" if wraps else "edge"
     around = np.pad(np.pad(nearest, ((0, 0), (1, 1)), mode=beside), ((1, 1), (0, 0)), mode="edge")
     farthest = cv2.dilate(around, np.ones((3, 3), np.uint8))[1:-1, 1:-1]
-    limit = np.repeat(np.repeat(farthest, WIDER, axis=0), WIDER, axis=1)
-    return np.asarray((ranges < NOTHING) & (ranges <= limit * BEHIND))
+    limit = np.repeat(np.repeat(farthest, WIDER_PIXEL, axis=0), WIDER_PIXEL, axis=1)
+    return np.asarray((ranges < NOTHING_NEAR) & (ranges <= limit * HIDDEN_BEHIND))
 
 
 def fill_gaps(gray: Floats, weight: Floats) -> tuple[Floats, Mask]:
@@ -176,13 +176,13 @@ def fill_gaps(gray: Floats, weight: Floats) -> tuple[Floats, Mask]:
         pyramid.append((_resize_image(pyramid[-1][0], size), _resize_image(pyramid[-1][1], size)))
     total, known = pyramid.pop()
     filled: Floats = total / np.maximum(known, 1e-6)
-    counts: Floats = (known > LEAST_FILLED).astype(np.float32)
+    counts: Floats = (known > LEAST_FILLED_PIXEL).astype(np.float32)
     for total, known in reversed(pyramid):
         size = total.shape[1], total.shape[0]
         wider = _resize_image(filled * counts, size)
         counts = known + (1.0 - known) * _resize_image(counts, size)
         filled = (total + (1.0 - known) * wider) / np.maximum(counts, 1e-6)
-        counts = (counts > LEAST_FILLED).astype(np.float32)
+        counts = (counts > LEAST_FILLED_PIXEL).astype(np.float32)
     return filled, counts > 0.0
 
 
@@ -195,7 +195,7 @@ def _resize_image(image: Floats, size: tuple[int, int]) -> Floats:
 def cone_of_picture(shape: tuple[int, int], focal: float) -> Cone:
     """Return the cone around a pinhole's picture (H, W) with a focal length [px], in the camera's frame."""
     half_diagonal = 0.5 * math.hypot(*shape)
-    return Cone(1.0, 0.0, 0.0, focal / math.hypot(focal, half_diagonal)).widen(ROUNDING)
+    return Cone(1.0, 0.0, 0.0, focal / math.hypot(focal, half_diagonal)).widen(CONE_ROUNDING)
 
 
 def render_gray(octree: Octree, pose: Pose, is_drawn: Mask, focal: float = 0.0) -> ViewImage:

@@ -17,11 +17,12 @@ from ..evidence.verification import Verified, draw_near, verify
 from ..geometry.pose import Pose
 from ..jobs.threads import Once, Workers
 from ..judge.candidate import Candidate
-from ..judge.selection import CHANCE_MATCHES, FAINT_SCORE, is_clear, is_sure, rank
+from ..judge.selection import is_clear, is_sure, rank
 from ..local_features.hypotheses import count_matches, propose_poses
 from ..local_features.keypoints import Keypoints, join_keypoints
 from ..local_features.matching import Matches, join_matches
 from ..photo import NOTHING_KNOWN
+from ..problem.method import Method
 from ..problem.problem import Problem
 from ..problem.profile import Beam, Tilts
 from ..problem.settings import Effort
@@ -31,12 +32,9 @@ from .beam import refine_matches, refine_starts, score_mirror, score_starts
 from .means import Means
 from .search import search_poses
 
-FIRST_MIRROR_RATIO = 1.1  # least ratio of first scores, photo to mirrored photo
 FIRST_BEAM = Beam(100, 12, 4, 1)
 FIRST_ROTATIONS = 1000  # of SO(3)
 FEW_CELLS = 200  # of the grid; if a prior leaves fewer, all of them are searched
-ENOUGH_MATCHES = 40  # of a part of the features: if the pose is sure, the others are not asked
-NUM_MATCHED = 6  # poses from matches that are refined
 COS_TILT = math.cos(math.radians(12.0))  # most angle between their vertical and a known one
 
 
@@ -92,12 +90,13 @@ def look_first(problem: Problem, known: list[Candidate], means: Means) -> tuple[
             found = known + refine_starts(problem, starts, FIRST_BEAM, workers)
             if not is_clear(problem.profile, choose(problem, rank(found), workers)):
                 return found, False
-            return found, beats_mirror(score_starts(problem, starts, workers), of_mirror())
+            own = score_starts(problem, starts, workers)
+            return found, beats_mirror(problem.method, own, of_mirror())
 
 
-def beats_mirror(own: float, mirrored: float) -> bool:
+def beats_mirror(method: Method, own: float, mirrored: float) -> bool:
     """Return True if first scores tell a photo from its mirror image."""
-    return own >= FIRST_MIRROR_RATIO * mirrored
+    return own >= method.first_mirror_ratio * mirrored
 
 
 def draw_found(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
@@ -117,7 +116,7 @@ def look_along_walls(problem: Problem, known: list[Candidate], means: Means) -> 
 def search_part(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
     """Search by a part of the features; its poses are dropped unless they are sure: all find better ones."""
     poses, matches = match_poses(problem, means)
-    if not poses or count_matches(matches, poses[0]) < ENOUGH_MATCHES:
+    if not poses or count_matches(matches, poses[0]) < problem.method.enough_matches:
         return known, False
     found, is_enough = refine_matched(problem, poses, known, means)
     return (found, True) if is_enough else (known, False)
@@ -156,7 +155,7 @@ def search_views(
 def end_search(problem: Problem, found: list[Candidate], workers: Workers) -> tuple[list[Candidate], bool]:
     """Return the candidates with what was drawn at them; True if the best is sure."""
     ranked = rank(found)
-    if ranked.best.score < FAINT_SCORE:
+    if ranked.best.score < problem.method.faint_score:
         return found, False
     chosen = choose(problem, ranked, workers)
     drawn = {id(candidate.pose): candidate for candidate in chosen.candidates}
@@ -182,7 +181,8 @@ def add_verified(problem: Problem, candidates: list[Candidate], workers: Workers
 
     verified = workers.map(verify_one, rank(candidates).candidates, "verify")
     drawn = {id(candidate.pose): candidate for candidate, _ in verified}
-    matched = [(near, found.pose) for near, found in verified if found.num_matches > CHANCE_MATCHES]
+    chance = problem.method.chance_matches
+    matched = [(near, found.pose) for near, found in verified if found.num_matches > chance]
     refined = workers.map(lambda pair: examine(problem, pair[1], pair[0]), matched, "compare")
     return [*(drawn.get(id(one.pose), one) for one in candidates), *refined]
 
@@ -209,7 +209,7 @@ def match_poses(problem: Problem, means: Means) -> tuple[list[Pose], Matches]:
     up_cam = problem.photo.R_cam_from_level[:, 2]
     with means.watch.stage("match"):
         matches = join_features(problem, workers)[1]
-        poses = [f.pose for f in propose_poses(matches, NUM_MATCHED, workers)]
+        poses = [f.pose for f in propose_poses(matches, problem.method.most_matched, workers)]
     kept = [pose for pose in poses if not is_level or pose.R_cam_from_world[:, 2] @ up_cam >= COS_TILT]
     return kept, matches
 

@@ -29,10 +29,7 @@ from ..views.view import ViewArrays
 from .ladder import climb, refine
 from .search import Starts, search_poses
 
-BATCH = 16  # starts that a thread takes at a time
-NUM_FOUND = 12  # poses of a search, at most
-FAINT_PART = 0.25  # of the best score: poses with less are dropped
-NUM_SCORED = 64  # starts, if only the best score is needed
+STARTS_A_TASK = 16  # starts that a thread takes at a time
 
 
 class Ends(NamedTuple):
@@ -58,7 +55,8 @@ def refine_starts(problem: Problem, starts: Starts, beam: Beam, workers: Workers
     fine = workers.map(partial(descend, stage=FINE), narrow(perturbed, beam.num_fine), "descend")
     best = [end.pose for end in best_distinct(fine, beam.num_perturbed, DESCENDED)]
     ends = workers.map(partial(climb, problem, workers=workers), best, "descend")
-    kept = keep_comparable(keep_distinct([*ends, *fine], middle))
+    distinct = keep_distinct([*ends, *fine], middle, problem.method.most_found)
+    kept = keep_comparable(distinct, problem.method.faint_part)
 
     def examine_end(end: Hypothesis) -> Candidate:
         return replace(examine(problem, end.pose), is_climbed=end.is_climbed)
@@ -101,14 +99,14 @@ def narrow(fits: Sequence[Hypothesis], count: int) -> list[Pose]:
     return [ranked[k] for k in best_and_alternatives(rotations, centers, count, DESCENDED)]
 
 
-def keep_distinct(fine: Sequence[Hypothesis], middle: Sequence[Hypothesis]) -> list[Hypothesis]:
+def keep_distinct(fine: Sequence[Hypothesis], middle: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
     """Return the best poses of fine cells, then of middle cells, by non-maximum suppression."""
-    return suppress_near([*sort_by_score(fine), *sort_by_score(middle)], NUM_FOUND, ONE_ANSWER)
+    return suppress_near([*sort_by_score(fine), *sort_by_score(middle)], most, ONE_ANSWER)
 
 
-def keep_comparable(ranked: Sequence[Hypothesis]) -> list[Hypothesis]:
+def keep_comparable(ranked: Sequence[Hypothesis], faint_part: float) -> list[Hypothesis]:
     """Drop the fits that score far below the best: a comparison could not bring them near it."""
-    least = FAINT_PART * max((f.score for f in ranked), default=0.0)
+    least = faint_part * max((f.score for f in ranked), default=0.0)
     return [f for f in ranked if f.score >= least]
 
 
@@ -125,7 +123,7 @@ def score_briefly(problem: Problem, effort: Effort, workers: Workers) -> float:
 
 def score_mirror(problem: Problem, effort: Effort, workers: Workers) -> float:
     """Return the best score of a brief search with the photo mirrored."""
-    return score_briefly(problem.mirror(), effort.brief(NUM_SCORED), workers)
+    return score_briefly(problem.mirror(), effort.brief(problem.method.scored_starts), workers)
 
 
 def score_near(problem: Problem, pose: Pose, workers: Workers) -> float:
@@ -138,7 +136,7 @@ def score_near(problem: Problem, pose: Pose, workers: Workers) -> float:
 
 def score_starts(problem: Problem, starts: Starts, workers: Workers) -> float:
     """Return the best score after short descents from the best starts."""
-    best = starts.take(np.arange(min(NUM_SCORED, len(starts.candidate))))
+    best = starts.take(np.arange(min(problem.method.scored_starts, len(starts.candidate))))
     return descend_prepared(problem, best, FIRST, workers).best_score
 
 
@@ -207,7 +205,7 @@ def descend_prepared(problem: Problem, starts: Starts, stage: Stage, workers: Wo
     cone = find_cone(image)
 
     def run(lo: int) -> None:
-        part = slice(lo, lo + BATCH)
+        part = slice(lo, lo + STARTS_A_TASK)
         descend_starts(
             views,
             view,
@@ -222,6 +220,6 @@ def descend_prepared(problem: Problem, starts: Starts, stage: Stage, workers: Wo
             scores[part],
         )
 
-    workers.map(run, range(0, len(t), BATCH), "descend")
+    workers.map(run, range(0, len(t), STARTS_A_TASK), "descend")
     order = np.argsort(-scores, kind="stable")
     return Ends(Starts(R, t, starts.candidate).take(order), scores[order])

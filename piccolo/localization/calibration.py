@@ -17,8 +17,8 @@ from ..evidence.lens_matches import fit_matches
 from ..evidence.self_calibration import descend_freely, estimate_corrections
 from ..evidence.sphere import (
     CLAIM,
-    CURVATURE,
     NO_CORRECTION,
+    SPHERE_CURVATURE,
     SphereFit,
     count_deviations,
     make_freedom,
@@ -33,16 +33,15 @@ from ..problem.problem import Features, Problem
 from ..problem.stages import Limits
 from .last_descent import refine_best
 
-CLEARLY = 2.5  # deviations by which matches must tell another focal length
-MIN_SCORE_LEFT = 0.95  # fraction of the score that it must keep
+MIN_CALIBRATED_SCORE_LEFT = 0.95  # fraction of the score that it must keep
 MAX_CALIBRATIONS = 4  # fits of a focal length
 SUSPECT = 0.8  # deviations between claim and picture, from which other geometries are searched
-CONTRADICTED = 3.0  # from which one that explains more is taken
-MIN_GAIN = 1.1  # times the score, by another geometry
+CONTRADICTED_DEVIATIONS = 3.0  # from which one that explains more is taken
+MIN_RETAKE_GAIN = 1.1  # times the score, by another geometry
 MOST_ROUNDS = 3
-CHECK = Limits(1.0, 8, 1e-3)
-FULL = Limits(0.7, 15, 1e-4)  # on points, where the claim does not hold
-HERE = Limits(0.7, 1, 1e-4)  # and where it does, which tells how exact it is
+CHECK_LIMITS = Limits(1.0, 8, 1e-3)
+FULL_LIMITS = Limits(0.7, 15, 1e-4)  # on points, where the claim does not hold
+HERE_LIMITS = Limits(0.7, 1, 1e-4)  # and where it does, which tells how exact it is
 
 
 def calibrate(problem: Problem, found: Selection, workers: Workers) -> tuple[Problem, Selection, FocalFit]:
@@ -89,12 +88,12 @@ def refine_with(
 def follow_matches(problem: Problem, found: Selection, workers: Workers) -> tuple[Problem, Selection]:
     """Begin with the focal length by which most matches agree, if that is clearly another."""
     matches = list_matches(problem, found.best, workers)
-    by_matches = fit_matches(problem.given.cameras[0], found.best.pose, matches, FOCAL_WIDTHS)
+    by_matches = fit_matches(problem.method, problem.given.cameras[0], found.best.pose, matches, FOCAL_WIDTHS)
     change = float(by_matches.values[FOCAL])
-    if abs(change) * math.sqrt(by_matches.information) < CLEARLY:
+    if abs(change) * math.sqrt(by_matches.information) < problem.method.clear_deviations:
         return problem, found
     other = refine_with(problem, found, np.array([change]), by_matches.pose, workers)
-    return other if other[1].best.score > MIN_SCORE_LEFT * found.best.score else (problem, found)
+    return other if other[1].best.score > MIN_CALIBRATED_SCORE_LEFT * found.best.score else (problem, found)
 
 
 def recalibrate(problem: Problem, change: Array, workers: Workers) -> Problem:
@@ -133,11 +132,11 @@ def calibrate_sphere(
     fine = problem.photo.image("fine")
     full = problem.photo.image("full")
     descents = [
-        partial(descend_freely, cells, fine, freedom, pose, NO_CORRECTION, CHECK),
-        partial(descend_freely, points, full, freedom, pose, NO_CORRECTION, HERE),
+        partial(descend_freely, cells, fine, freedom, pose, NO_CORRECTION, CHECK_LIMITS),
+        partial(descend_freely, points, full, freedom, pose, NO_CORRECTION, HERE_LIMITS),
     ]
     ends = workers.map(operator.call, descents, "fit the panorama")
-    estimate, here = (estimate_corrections(end, CURVATURE) for end in ends)
+    estimate, here = (estimate_corrections(end, SPHERE_CURVATURE) for end in ends)
     is_suspect = count_deviations(estimate) > SUSPECT
     other = retake_as_found(problem, found, camera, workers) if is_suspect else None
     if other is not None:
@@ -152,7 +151,7 @@ def retake_as_found(
 ) -> tuple[Problem, Selection, SphereFit] | None:
     """Search other geometries; return the problem with one that explains clearly more, refined, or None."""
     end = search_geometry(problem, found.best.pose, claimed, workers)
-    if count_deviations(estimate_corrections(end, CURVATURE)) < CONTRADICTED:
+    if count_deviations(estimate_corrections(end, SPHERE_CURVATURE)) < CONTRADICTED_DEVIATIONS:
         return None
     given = problem.given
     camera = claimed
@@ -166,9 +165,9 @@ def retake_as_found(
         pose = best.best.pose
         points = problem.view_at(pose, "points")
         full = problem.photo.image("full")
-        end = descend_freely(points, full, make_freedom(camera), pose, NO_CORRECTION, FULL)
+        end = descend_freely(points, full, make_freedom(camera), pose, NO_CORRECTION, FULL_LIMITS)
         if np.all(np.abs(end.values) < CLAIM.deviations):
             break
-    if best.best.score < MIN_GAIN * found.best.score:
+    if best.best.score < MIN_RETAKE_GAIN * found.best.score:
         return None
-    return problem, best, SphereFit(camera, estimate_corrections(end, CURVATURE), is_claimed=False)
+    return problem, best, SphereFit(camera, estimate_corrections(end, SPHERE_CURVATURE), is_claimed=False)

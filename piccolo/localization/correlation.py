@@ -17,10 +17,10 @@ from ..kernels.jit import F0, F1, kernel
 EXACT = (1 << 24) - 1  # whole numbers up to this are exact in float32
 MOST_LEVEL = 127.5  # of a channel
 MOST_ENERGY = 3.0 * MOST_LEVEL**2  # of a cell
-BLOCK = 512  # views a matrix product, at most
+VIEWS_A_PRODUCT = 512  # views a matrix product, at most
 LEAST_SEEN = 0.3  # of what a photo shows, by a view that it is compared with
 ALL_SEEN = np.float32(255.0)  # of a view's cell
-FLAT = 6.0  # [levels] a smaller deviation counts as this
+FLAT_VIEW = 6.0  # [levels] a smaller deviation counts as this
 Samples = Array32
 
 
@@ -100,7 +100,7 @@ def thread_block(num_views: int, num_cells: int) -> list[Samples]:
     """Return the calling thread's own arrays for `unpack_views`: allocation costs as much as products."""
     kept: list[Samples] = getattr(_local, "block", [])
     if not kept or len(kept[0]) < num_views or kept[1].shape[1] != num_cells:
-        num_rows = max(BLOCK, num_views)
+        num_rows = max(VIEWS_A_PRODUCT, num_views)
         shapes = (num_rows, 3 * num_cells), (num_rows, num_cells), (num_rows, num_cells), (num_rows,)
         kept = _local.block = [np.empty(shape, np.float32) for shape in shapes]
     return [each[:num_views] for each in kept]
@@ -119,7 +119,7 @@ def masked_correlation(
     scaled = (panorama.area * whole_scale(MOST_ENERGY, 1, num_cells)).astype(np.float32)
     scores = np.empty((len(features), len(weighted)), np.float32)
     is_full = bool(panorama.validity.all())
-    size = max(min(BLOCK, -(-len(features) // workers.num_threads)), 1)  # so that none is idle
+    size = max(min(VIEWS_A_PRODUCT, -(-len(features) // workers.num_threads)), 1)  # so that none is idle
 
     def correlate(lo: int) -> None:
         some = features[lo : lo + size]
@@ -193,12 +193,12 @@ def subtract_means(
     """Write correlations from sums over the shared cells, see `center_correlation`.
 
     `of_view` and `of_photo` (views, 3, rotations) are sums of the channels, `units` the factors that made
-    whole numbers: of samples, view and photo energies, and areas. Deviations below FLAT count as FLAT. The
-    correlation is multiplied by the root of the fraction that a view sees of what the photo shows, and is 0
-    if that is less than LEAST_SEEN.
+    whole numbers: of samples, view and photo energies, and areas. Deviations below FLAT_VIEW count as that.
+    The correlation is multiplied by the root of the fraction that a view sees of what the photo shows, and is
+    0 if that is less than LEAST_SEEN.
     """
     per_sample, per_view, per_photo, per_area = units
-    least = np.float32(FLAT * FLAT)
+    least = np.float32(FLAT_VIEW * FLAT_VIEW)
     for i in range(len(scores)):
         for r in range(scores.shape[1]):
             seen = weight[i, r] / (shown_area[r] * ALL_SEEN)

@@ -26,8 +26,6 @@ from .ladder import settle
 from .means import Means, Step, describe_selection
 from .mirror import find_mirrored
 
-WORTH_ASKING = 0.2  # least probability of all poses together, for which the mirrored photo is tried
-
 
 class Found(NamedTuple):
     """The poses found for a photo, refined, with all evidence by which they are chosen."""
@@ -53,7 +51,7 @@ def judge(found: Found, means: Means, min_confidence: float, may_promote: bool =
         return nothing_found()
     reported, is_copy = list_reported(problem, selection, means.effort, workers)
     standings = credit_copies(assess(problem.profile, reported), is_copy)
-    places = posterior(standings, measured.errors.std_of_fit)[:-1]
+    places = posterior(standings, measured.errors.std_of_fit, problem.method)[:-1]
     likeliest = int(places.argmax())
     if likeliest and is_copy[likeliest] and may_promote:
         other = promote(problem, selection, reported.candidates[likeliest], fit, workers)
@@ -113,9 +111,9 @@ def decide_case(problem: Problem, case: Case, belief: Belief, means: Means, min_
     if case.geometry is not None:  # no pose is surer than what it rests on
         belief = replace(belief, doubt=case.geometry.doubt)
     best = case.found.best
-    if belief.probabilities[-1] < 1.0 - WORTH_ASKING:
+    if belief.probabilities[-1] < 1.0 - problem.method.worth_asking:
         mirrored = find_mirrored(problem, best, means.effort, means.workers)
-        case = case._replace(is_mirrored=is_mirrored(best, mirrored))
+        case = case._replace(is_mirrored=is_mirrored(problem.method, best, mirrored))
     found = conclude(problem.scan_map, case, belief, min_confidence)
     means.trace.note("judged", partial(describe_case, problem, case, found.belief))
     return found

@@ -19,19 +19,16 @@ from ..optimize.channel_loss import ChannelProblem, descend_channels, score
 from ..optimize.levenberg_marquardt import retract
 from ..panorama.local_normalization import LEVELS_PER_UNIT, to_levels
 from ..panorama.texels import Texels
+from ..problem.method import Method
 from ..problem.problem import Problem
 from ..problem.profile import VIEWS
 from ..problem.stages import AROUND_FINE, AROUND_MIDDLE, FINE, FULL, LAST, MIDDLE, Limits, Stage
 from ..views.points_around import PLACE_SPACING
 from ..views.view import Cells
 
-PERTURBED_DISTANCE = 0.25  # [m]
-PERTURBED_ANGLE = math.radians(8.0)
 PERTURBED_BATCH = 3  # perturbed poses that a thread takes
-MAX_PERTURBATIONS = 5  # rounds
-MIN_GAIN = 0.02  # of the score in a round, relative; a round with less is the last
 MAX_UNOCCLUDED = 2  # rounds that mask occluders
-MIN_SCORE_LEFT = 0.9  # fraction of the score that a descent on points must keep
+MIN_POINTS_SCORE_LEFT = 0.9  # fraction of the score that a descent on points must keep
 
 
 def refine(problem: Problem, start: Pose, workers: Workers, stage: Stage) -> Hypothesis:
@@ -65,16 +62,16 @@ def climb(problem: Problem, start: Pose, workers: Workers) -> Hypothesis:
         return refine(problem, around.pose, workers, FINE)
 
     begin = score_on_cells(first, blocks, problem.photo.image(FINE.image), start)
-    return replace(climb_by(perturb, begin), is_climbed=True)
+    return replace(climb_by(perturb, begin, problem.method), is_climbed=True)
 
 
-def climb_by(perturb: Callable[[Hypothesis], Hypothesis], best: Hypothesis) -> Hypothesis:
+def climb_by(perturb: Callable[[Hypothesis], Hypothesis], best: Hypothesis, method: Method) -> Hypothesis:
     """Perturb the best pose, and descend from there, for as long as its score rises."""
-    for _ in range(MAX_PERTURBATIONS):
+    for _ in range(method.most_perturbations):
         refined = perturb(best)
         gain = refined.score - best.score
         best = refined if gain > 0.0 else best
-        if gain < MIN_GAIN * refined.score:
+        if gain < method.least_gain * refined.score:
             break
     return best
 
@@ -86,7 +83,7 @@ def climb_from_afar(problem: Problem, start: Pose, workers: Workers) -> tuple[Po
     """
     end = seen_from = refine(problem, start, workers, MIDDLE).pose
     best = refine(problem, end, workers, FINE)
-    for _ in range(MAX_PERTURBATIONS):
+    for _ in range(problem.method.most_perturbations):
         other = refine(problem, end, workers, AROUND_MIDDLE).pose
         if other.distance(end) < PLACE_SPACING:
             break
@@ -95,7 +92,7 @@ def climb_from_afar(problem: Problem, start: Pose, workers: Workers) -> tuple[Po
         if gain > 0.0:
             best = around
             seen_from = other
-        if gain < MIN_GAIN * around.score:
+        if gain < problem.method.least_gain * around.score:
             break
         end = best.pose
     return best.pose, seen_from
@@ -114,7 +111,7 @@ def climb_unoccluded(problem: Problem, start: Candidate, workers: Workers) -> Ca
         climbed = climb_masked(problem, best, workers) if is_occluded else climb_whole(problem, best, workers)
         gain = climbed.score - before.score
         best = climbed if gain > 0.0 or climbed.pose is before.pose else best
-        if not is_occluded or gain < MIN_GAIN * climbed.score:
+        if not is_occluded or gain < problem.method.least_gain * climbed.score:
             break
     return best
 
@@ -151,7 +148,8 @@ def settle(problem: Problem, found: Candidate, workers: Workers) -> Candidate:
 def converge(problem: Problem, found: Candidate, stage: Stage, workers: Workers) -> Candidate:
     """Descend on the points visible from the pose, in the rounds of a stage.
 
-    It descends with the candidate's unoccluded photo; an end below MIN_SCORE_LEFT of its score is discarded.
+    It descends with the candidate's unoccluded photo; an end below MIN_POINTS_SCORE_LEFT of its score is
+    discarded.
     """
     assert found.unoccluded is not None
     shown = problem.show(found.unoccluded.photo)
@@ -163,7 +161,7 @@ def converge(problem: Problem, found: Candidate, stage: Stage, workers: Workers)
         if math.dist(pose.center_world, center) < stage.rounds.arrived:
             break
     end = examine(problem, pose, found)
-    return end if end.score > MIN_SCORE_LEFT * found.score else found
+    return end if end.score > MIN_POINTS_SCORE_LEFT * found.score else found
 
 
 @kernel
@@ -203,10 +201,11 @@ def descend_perturbed(
         scores[k] = score(points, levels, weights, blocks, fine.rgbx, fine.width, R[k], t[k])
 
 
-def perturbations(size: float) -> Array:
+def perturbations(method: Method, size: float) -> Array:
     """Return steps (9, 6), rotation [rad] and translation [m]: zero, then to the corners of a cube."""
     signs = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) / math.sqrt(3.0)
-    steps = np.concatenate([signs[:, ::-1] * PERTURBED_ANGLE, signs * PERTURBED_DISTANCE], axis=1) * size
+    turns = signs[:, ::-1] * method.perturbed_angle
+    steps = np.concatenate([turns, signs * method.perturbed_distance], axis=1) * size
     return np.concatenate([np.zeros((1, 6)), steps])
 
 
@@ -237,7 +236,7 @@ def descend_around(problem: Problem, cells: Cells, pose: Pose, stage: Stage, wor
     coarse = problem.photo.image(stage.around.image)
     fine = problem.photo.image(stage.image)
     limits = stage.limits
-    steps = perturbations(stage.around.size)
+    steps = perturbations(problem.method, stage.around.size)
     R = np.repeat(pose.R_cam_from_world[None], len(steps), axis=0)
     t = np.repeat((pose.center_world - cells.center_map)[None], len(steps), axis=0)
     scores = np.empty(len(steps))

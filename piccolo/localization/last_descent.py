@@ -7,12 +7,12 @@ from functools import partial
 from ..evidence.examine import choose, complete
 from ..jobs.threads import Workers
 from ..judge.candidate import Candidate, Selection
-from ..judge.selection import SURE_MATCHES, count_matches, is_faint, rank
+from ..judge.selection import count_matches, is_faint, rank
+from ..problem.method import Method
 from ..problem.problem import Problem
 from .ladder import climb_to_full, climb_unoccluded, settle
 
 HOPELESS_SCORE = 0.02  # black, white and noisy pictures, and most photos of other places, have less
-NEAR_SCORE = 0.6  # an alternative with this fraction of the best score is refined like the best
 MAX_REFINED = 4  # alternatives
 
 
@@ -29,7 +29,7 @@ def refine_best(problem: Problem, candidates: Sequence[Candidate], workers: Work
         found = choose(problem, rank([best, *found.alternatives]), workers)
         if is_faint(problem.profile, found):
             return found
-    near, far = part_near(found, count_matches(problem.profile, found.candidates)[1:])
+    near, far = part_near(problem.method, found, count_matches(problem.profile, found.candidates)[1:])
     if not near:
         best = climb_unoccluded(problem, found.best, workers)
         return settle_best(problem, rank([best, *found.alternatives]), workers)
@@ -37,12 +37,14 @@ def refine_best(problem: Problem, candidates: Sequence[Candidate], workers: Work
     return settle_best(problem, choose(problem, rank([*refined, *far]), workers), workers)
 
 
-def part_near(found: Selection, counts: Sequence[int]) -> tuple[list[Candidate], list[Candidate]]:
+def part_near(
+    method: Method, found: Selection, counts: Sequence[int]
+) -> tuple[list[Candidate], list[Candidate]]:
     """Part the alternatives, with their matches, in those that come near the best and others."""
     near: list[Candidate] = []
     far: list[Candidate] = []
     for h, count in zip(found.alternatives, counts, strict=True):
-        is_near = h.score > NEAR_SCORE * found.best.score or count >= SURE_MATCHES
+        is_near = h.score > method.near_score * found.best.score or count >= method.sure_matches
         (near if is_near and len(near) < MAX_REFINED else far).append(h)
     return near, far
 

@@ -60,7 +60,7 @@ def prepare_search(
         allowed_map = apply_prior(scan_map, settings.prior)
         if len(allowed_map.sparse) == 0 or not panorama.is_valid.any():
             return None
-        return prepare_problem(panorama, allowed_map, settings.prior, settings.gravity)
+        return prepare_problem(panorama, allowed_map, settings.prior, settings.gravity, settings.method)
 
 
 def explain_nothing(scan_map: ScanMap, panorama: Panorama, prior: Prior) -> Result:

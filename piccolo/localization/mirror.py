@@ -12,14 +12,13 @@ from ..judge.candidate import Candidate
 from ..judge.selection import explains_more
 from ..local_features.hypotheses import propose_poses
 from ..local_features.matching import match
-from ..problem.photo_images import ACROSS
+from ..problem.photo_images import MIRROR
 from ..problem.problem import Problem
 from ..problem.settings import Effort
 from .attempts import FIRST_BEAM, join_features
 from .beam import descend_briefly, refine_matches, refine_starts, score_briefly, score_near
 from .search import search_poses
 
-ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
 FOUND_AGAIN = 0.9  # least score of an end of a brief search, as a fraction of the pose's, to count as found
 UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 
@@ -27,14 +26,14 @@ UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 def find_mirrored(problem: Problem, best: Candidate, effort: Effort, workers: Workers) -> Candidate | None:
     """Return the best pose of the mirrored photo; None if there is none that explains more.
 
-    Not searched are photos with a score of ENOUGH_EXPLAINED, scans without colours, and poses by whole views
+    Not searched are photos with a score that is enough, scans without colours, and poses by whole views
     alone: the first look has compared these with the mirrored photo.
     """
-    if best.score >= ENOUGH_EXPLAINED or not problem.profile.uses_matches:
+    if best.score >= problem.method.enough_explained or not problem.profile.uses_matches:
         return None
     mirrored = problem.mirror()
     found = search_mirrored(problem, mirrored, best.pose, effort, workers)
-    if not found or not explains_more(found[0], best):
+    if not found or not explains_more(problem.method, found[0], best):
         return None
     return count_agreeing(mirrored, found[0], workers)
 
@@ -64,7 +63,7 @@ def search_mirrored(
 def list_mirrored(R_cam_from_map: Array, num_yaws: int) -> Array:
     """Return rotations (2 N, 3, 3) of a mirrored photo: at the tilt of a pose, and at that upside down."""
     yaws = uniform_yaws(num_yaws)
-    tilt = ACROSS @ R_cam_from_map @ ACROSS
+    tilt = MIRROR @ R_cam_from_map @ MIRROR
     return np.asarray(tilt @ np.concatenate([yaws, UPSIDE_DOWN @ yaws]))
 
 

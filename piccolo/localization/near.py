@@ -45,7 +45,8 @@ def refine_near(problem: Problem, start: Pose, workers: Workers) -> Near:
     if end.score >= HOPELESS_SCORE:
         sees_same = end.pose.distance(middle) < NEARLY
         errors = estimate_covariance(problem, end, workers, middle if sees_same else None)
-    place = float(posterior([assess_end(problem, end, workers)], errors.std_of_fit)[0])
+    standing = assess_end(problem, end, workers)
+    place = float(posterior([standing], errors.std_of_fit, problem.method)[0])
     return Near(end, errors.gaussian, place)
 
 

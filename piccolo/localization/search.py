@@ -13,21 +13,20 @@ from ..jobs.threads import Workers
 from ..kernels.jit import F0, kernel
 from ..panorama.local_normalization import sample_channels
 from ..panorama.texels import Texels
+from ..problem.method import Method
 from ..problem.prior import allow_rotations
 from ..problem.problem import Problem
 from ..problem.profile import Tilts
 from ..problem.settings import Effort
 from ..scan_map.scan_map import ScanMap
 from ..views.candidate_views import WIDE_RINGS
-from .correlation import BLOCK, Samples, correlate_pairs, masked_correlation, weigh_by_area
+from .correlation import VIEWS_A_PRODUCT, Samples, correlate_pairs, masked_correlation, weigh_by_area
 
 ROTATIONS_AT_ONCE = 256  # that a thread averages
 SCORES_AT_ONCE = 1 << 23  # 32 MB
 LOWEST = np.float32(-np.inf)
 TURNED_BYTES = 4 * 16  # of a rotation, a cell: channels, validity, energy, and what they are made from
-CANDIDATES_PER_START = 2
 MIN_STARTS = 1000
-POSES_PER_START = 12
 PITCHES_DEG = (-27.0, -18.0, -9.0, 0.0, 9.0, 18.0, 27.0)  # of a camera held about level
 NUM_LEVEL_YAWS = 40
 
@@ -148,7 +147,7 @@ def best_poses_wide(
 
 def views_at_once(num_rotations: int) -> int:
     """Return the number of views whose scores are held at a time."""
-    return max(SCORES_AT_ONCE // num_rotations, BLOCK)
+    return max(SCORES_AT_ONCE // num_rotations, VIEWS_A_PRODUCT)
 
 
 def best_poses(scores: Samples, pool: int, least: np.float32 = LOWEST) -> tuple[Int64s, Int64s, Samples]:
@@ -188,8 +187,8 @@ def search_poses(problem: Problem, tilts: Tilts, effort: Effort, workers: Worker
     samples, validity = turn_panorama(problem.photo.images.search(), rotations)
     profile = problem.profile
     most = effort.max_starts
-    num_starts = thin_starts(len(m.sparse), most) if profile.thins_starts else most
-    pool = num_starts * POSES_PER_START
+    num_starts = thin_starts(profile.method, len(m.sparse), most) if profile.thins_starts else most
+    pool = num_starts * profile.method.poses_per_start
     sparse, turn, _ = best_poses_wide(m, samples, validity, pool, num_views, workers, profile.subtracts_means)
     candidate = m.sparse[sparse]
     R = rotations[turn]
@@ -208,9 +207,9 @@ def search_poses(problem: Problem, tilts: Tilts, effort: Effort, workers: Worker
     return Starts(R[kept][order], centers[kept][order], candidate[order])
 
 
-def thin_starts(num_candidates: int, most: int) -> int:
+def thin_starts(method: Method, num_candidates: int, most: int) -> int:
     """Return from how many poses descents begin, where there are few candidates from fewer."""
-    return min(max(num_candidates // CANDIDATES_PER_START, MIN_STARTS), most)
+    return min(max(num_candidates // method.candidates_per_start, MIN_STARTS), most)
 
 
 def list_rotations(problem: Problem, tilts: Tilts, effort: Effort) -> Array:

@@ -12,7 +12,6 @@ from ..geometry.pose import Pose, uniform_yaws, yaw_rotation
 from ..geometry.sphere import find_cell, pixel_rays
 from ..jobs.threads import Workers
 from ..judge.candidate import Candidate, Selection
-from ..judge.selection import CLEAR_MARGIN
 from ..panorama.gpano import attitude_of_gravity
 from ..problem.problem import Problem, prepare_problem
 from ..problem.profile import choose_profile
@@ -37,7 +36,7 @@ def is_tilt_known(problem: Problem) -> bool:
 
 def is_explained(found: Selection, searched: Problem) -> bool:
     """Return True if a pose explains a photo by its edges: one alone, unless lines lie along the walls."""
-    is_alone = found.margin > CLEAR_MARGIN or searched.rotations is not None
+    is_alone = found.margin > searched.method.clear_margin or searched.rotations is not None
     return found.best.score > searched.profile.clear_score and is_alone
 
 
@@ -77,7 +76,7 @@ def find_tilts(
     for axis in axes:
         x, y, z = -axis
         source = replace(problem.source, gpano=attitude_of_gravity((float(x), float(y), float(z))))
-        turned = prepare_problem(source, problem.scan_map, problem.prior, problem.gravity)
+        turned = prepare_problem(source, problem.scan_map, problem.prior, problem.gravity, problem.method)
         tried.append(align_level(turned, axes, yaw_of_walls))
     scores = []
     for one in tried:
@@ -117,6 +116,6 @@ def draw_scan(problem: Problem, pose: Pose, num_yaws: int) -> Problem:
     return replace(
         problem,
         photo=photo,
-        profile=choose_profile(photo.small.valid_share, photo.is_partial, has_shape=True),
+        profile=choose_profile(photo.small.valid_share, photo.is_partial, True, problem.method),
         rotations=pose.R_cam_from_world @ uniform_yaws(num_yaws),
     )

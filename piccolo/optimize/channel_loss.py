@@ -14,14 +14,14 @@ from ..geometry.robust import inline_geman_mcclure
 from ..geometry.sphere import BLOCK_RINGS, make_grid
 from ..kernels.jit import Scalar, inline_kernel, kernel
 from ..panorama.local_normalization import ZERO_LEVEL
-from ..panorama.texels import CHUNK, make_chunk, project, sample
+from ..panorama.texels import TEXEL_CHUNK, make_chunk, project, sample
 from .levenberg_marquardt import levenberg_marquardt
-from .normal_equations import COUNT, LOSS, block_adder
+from .normal_equations import COUNT_SUM, LOSS, block_adder
 
 NUM_BLOCKS = len(make_grid(BLOCK_RINGS))
 NUM_MOMENTS = 10
-FLAT = 6.0  # [levels] a smaller deviation of a block's channels counts as this
-CHANCE = 0.35  # a block's correlation that wrong poses reach
+FLAT_BLOCK = 6.0  # [levels] a smaller deviation of a block's channels counts as this
+CHANCE_CORRELATION = 0.35  # a block's correlation that wrong poses reach
 ZERO = np.float32(ZERO_LEVEL)
 
 
@@ -47,7 +47,7 @@ def read_channels(
 @inline_kernel
 def beyond_chance(correlation: float) -> float:
     """Return the part of a block's correlation that exceeds those of wrong poses, in [0, 1]."""
-    return max(correlation - CHANCE, 0.0) / (1.0 - CHANCE)
+    return max(correlation - CHANCE_CORRELATION, 0.0) / (1.0 - CHANCE_CORRELATION)
 
 
 add_channels = block_adder(read_channels, inline_geman_mcclure)
@@ -67,7 +67,7 @@ def channel_equations(
     total_weight = 0.0
     for n in range(len(weights)):
         total_weight += weights[n]
-    sums[LOSS] += (total_weight - sums[COUNT]) * 0.25 * scale * scale
+    sums[LOSS] += (total_weight - sums[COUNT_SUM]) * 0.25 * scale * scale
 
 
 @kernel
@@ -110,9 +110,9 @@ def correlate(
     """
     sums[:] = 0.0
     p = make_chunk()
-    found = np.empty((NUM_MOMENTS, CHUNK), np.float32)
-    for lo in range(0, len(weights), CHUNK):
-        hi = min(lo + CHUNK, len(weights))
+    found = np.empty((NUM_MOMENTS, TEXEL_CHUNK), np.float32)
+    for lo in range(0, len(weights), TEXEL_CHUNK):
+        hi = min(lo + TEXEL_CHUNK, len(weights))
         part = slice(lo, hi)
         x = points[0][part]
         y = points[1][part]
@@ -177,7 +177,7 @@ def score(
             product -= s[k] * s[k + 3] / s[3]
             energy -= s[k] * s[k] / s[3]
             other -= s[k + 3] * s[k + 3] / s[3]
-        least = FLAT * FLAT * s[3]
+        least = FLAT_BLOCK * FLAT_BLOCK * s[3]
         correlation = product / math.sqrt(max(energy, least) * max(other, least))
         total += beyond_chance(correlation) * s[3]
     return total

@@ -21,7 +21,7 @@ from .levenberg_marquardt import FALL, FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPIN
 # chosen: factor of the damping after a step that is not taken. A lens takes few steps, and with 8, as kernels
 # have, it ends elsewhere.
 REFUSED = 6.0
-TINY = 1e-9  # that makes matrices invertible, as in kernels
+TINY_DAMPING = 1e-9  # that makes matrices invertible, as in kernels
 Robust = Callable[[Array], tuple[Array, Array]]  # losses and weights (N,) of squares (N,)
 State = TypeVar("State")
 
@@ -35,7 +35,7 @@ class Equations(NamedTuple):
 
     def solve(self, damping: float = 0.0) -> Array:
         """Return the step (n,)."""
-        damped = self.matrix + np.diag(damping * self.matrix.diagonal() + TINY)
+        damped = self.matrix + np.diag(damping * self.matrix.diagonal() + TINY_DAMPING)
         return np.asarray(-np.linalg.solve(damped, self.gradient), np.float64)
 
     def add_known(self, off: Array, information: Array) -> "Equations":

@@ -19,7 +19,7 @@ FALL = 0.2  # of the damping after a step that was taken
 RISE = 8.0  # and one that was not
 # Float32 sums differ by this fraction from one pose to the next: a smaller rise counts as none. Without it
 # rounding ends a descent, some hundredths of a millimetre from the minimum.
-ROUNDING = 1e-7
+LOSS_ROUNDING = 1e-7
 
 Problem = TypeVar("Problem")
 
@@ -123,7 +123,7 @@ def levenberg_marquardt(
         # There is one call of the equations, as each would be compiled in; the first accepts the start.
         for left in range(num_iterations, -1, -1):
             equations(problem, R_new, t_new, new_sums)
-            if new_sums[LOSS] <= sums[LOSS] * (1.0 + ROUNDING):
+            if new_sums[LOSS] <= sums[LOSS] * (1.0 + LOSS_ROUNDING):
                 copy_to(R, R_new)
                 copy_to(t, t_new)
                 copy_to(sums, new_sums)

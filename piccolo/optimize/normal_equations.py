@@ -14,11 +14,11 @@ import numpy as np
 from ..arrays import Array, Array32, Int32s
 from ..geometry.sphere import pixel_jacobian
 from ..kernels.jit import F0, Scalar, inline_kernel, kernel
-from ..panorama.texels import CHUNK, Projected, blend_with_gradient, is_valid, make_chunk, project
+from ..panorama.texels import TEXEL_CHUNK, Projected, blend_with_gradient, is_valid, make_chunk, project
 
 NUM_SUMS = 29  # loss, count, gradient (6), upper triangle of the normal matrix (21)
 LOSS = 0  # where they begin
-COUNT = 1
+COUNT_SUM = 1
 GRADIENT = 2
 MATRIX = 8
 
@@ -141,8 +141,8 @@ def block_adder(
     ) -> None:
         points = make_chunk()
         X, Y, Z = xyz
-        for lo in range(0, len(X), CHUNK):
-            hi = min(lo + CHUNK, len(X))
+        for lo in range(0, len(X), TEXEL_CHUNK):
+            hi = min(lo + TEXEL_CHUNK, len(X))
             project(X[lo:hi], Y[lo:hi], Z[lo:hi], R_cam_from_world, center_world, texels, width, points)
             add_chunk(points, hi - lo, colors, lo, np.float32(width), scale, sums)
 

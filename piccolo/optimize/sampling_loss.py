@@ -15,14 +15,23 @@ from collections.abc import Callable
 import numpy as np
 
 from ..arrays import Array, Array32, Int32s
-from ..cloud.soa import FARTHEST, PackedPoints
+from ..cloud.soa import FARTHEST_POINT, PackedPoints
 from ..geometry.pose import Pose
 from ..geometry.robust import inline_absolute
 from ..kernels.jit import F0, F1, Scalar, inline_kernel, kernel
-from ..panorama.texels import CHUNK, Texels, bilinear_weights, blend, channel, is_valid, make_chunk, project
+from ..panorama.texels import (
+    TEXEL_CHUNK,
+    Texels,
+    bilinear_weights,
+    blend,
+    channel,
+    is_valid,
+    make_chunk,
+    project,
+)
 from .normal_equations import GRADIENT, MATRIX, NUM_SUMS, block_adder
 
-BLOCK = 4096
+POINTS_A_SUM = 4096
 # A pose at which masked pixels hide more of the cloud has no loss. If only a part of the panorama is valid,
 # this fraction is multiplied by the square of that part: a crop may face the nearer wall.
 MIN_SHOWN_SHARE = 0.5
@@ -39,11 +48,11 @@ def loss_blocks(
     x, y, z, rgbx = points
     p = make_chunk()
     for block in range(len(sums)):
-        begin = block * BLOCK
-        end = min(len(x), begin + BLOCK)
+        begin = block * POINTS_A_SUM
+        end = min(len(x), begin + POINTS_A_SUM)
         sums[block] = 0.0
-        for lo in range(begin, end, CHUNK):
-            hi = min(lo + CHUNK, end)
+        for lo in range(begin, end, TEXEL_CHUNK):
+            hi = min(lo + TEXEL_CHUNK, end)
             part = slice(lo, hi)
             project(x[part], y[part], z[part], R_cam_from_world, center_world, image.rgbx, image.width, p)
             colors = rgbx[lo:hi]
@@ -80,8 +89,8 @@ def normal_blocks(
     x, y, z, rgbx = points
     R, t = R_cam_from_world, center_world
     for block in range(len(sums)):
-        lo = block * BLOCK
-        part = slice(lo, min(len(x), lo + BLOCK))
+        lo = block * POINTS_A_SUM
+        part = slice(lo, min(len(x), lo + POINTS_A_SUM))
         sums[block] = 0.0
         xyz = (x[part], y[part], z[part])
         add_packed(xyz, rgbx[part], image.rgbx, image.width, R, t, HALF_LEVEL, sums[block])
@@ -89,9 +98,9 @@ def normal_blocks(
 
 def _sum_blocks(blocks: Callable[..., None], points: PackedPoints, texels: Texels, pose: Pose) -> Array:
     """Sum over all points, in float64, the rows that a kernel writes, one a block."""
-    if not np.abs(pose.center_world).max() < FARTHEST:  # NaN included: a kernel must not gather there
+    if not np.abs(pose.center_world).max() < FARTHEST_POINT:  # NaN included: a kernel must not gather there
         return np.zeros(NUM_SUMS)
-    sums = np.empty((-(-len(points) // BLOCK), NUM_SUMS if blocks is normal_blocks else 2))
+    sums = np.empty((-(-len(points) // POINTS_A_SUM), NUM_SUMS if blocks is normal_blocks else 2))
     arrays = points.x, points.y, points.z, points.rgbx
     blocks(arrays, texels, pose.R_cam_from_world, pose.center_world, sums)
     return np.asarray(sums.sum(axis=0))

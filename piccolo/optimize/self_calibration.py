@@ -12,7 +12,7 @@ from ..arrays import Array, Array32, Int64s
 from ..geometry.robust import inline_geman_mcclure
 from ..geometry.sphere import pixel_jacobian
 from ..kernels.jit import F0, kernel
-from ..panorama.texels import CHUNK, blend_with_gradient, is_valid, make_chunk, project
+from ..panorama.texels import TEXEL_CHUNK, blend_with_gradient, is_valid, make_chunk, project
 from .channel_loss import ChannelProblem
 
 NUM_OF_POSE = 6
@@ -57,8 +57,8 @@ def write_free_equations(
     for k in range(len(begins) - 1):
         g = gradients[k]
         A = matrices[k]
-        for lo in range(begins[k], begins[k + 1], CHUNK):
-            hi = min(lo + CHUNK, begins[k + 1])
+        for lo in range(begins[k], begins[k + 1], TEXEL_CHUNK):
+            hi = min(lo + TEXEL_CHUNK, begins[k + 1])
             X, Y, Z = points[0][lo:hi], points[1][lo:hi], points[2][lo:hi]
             project(X, Y, Z, identity, origin, texels, width, p)
             for i in range(hi - lo):

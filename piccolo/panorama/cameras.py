@@ -32,7 +32,7 @@ LONGEST = 2.5  # times as long as high is no photo, but a panorama that a phone 
 LONG = "no photo is that long: `projection` cylindrical and `fov_deg` tell of a phone's sweep panorama"
 AS_SPHERE = "read as a full sphere, as it is 2:1; if it is a photo, add `projection` pinhole: it has "
 GUESS = "`refine_focal` needs EXIF, `focal_px`, `camera`, or `projection` pinhole and `fov_deg`"
-MIN_REPORTED = 0.01  # of a picture: black borders below this are masked without a warning
+MIN_REPORTED_BORDER = 0.01  # of a picture: black borders below this are masked without a warning
 # deviations of a focal length's logarithm: of a guess, a number of pixels, a calibration, a field of view
 OF_GUESS = 0.2
 OF_PIXELS = 0.01
@@ -133,7 +133,7 @@ def read_views(
         borders = None if is_bounded else black_borders(own[..., :3], own[..., 3] > 0, is_full=False)
         if borders is not None:
             own[borders] = 0
-            if borders.mean() >= MIN_REPORTED:
+            if borders.mean() >= MIN_REPORTED_BORDER:
                 notes.append(f"masked black borders: {100 * borders.mean():.0f} % of the picture")
         views.append(shrunk(View(mount, own)))
     return views, tuple(notes)

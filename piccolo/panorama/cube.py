@@ -20,9 +20,9 @@ from ..arrays import Array32, Bytes, Mask
 from ..errors import InputError
 from ..geometry.sphere import pixel_rays
 from .gpano import Pixels
-from .picture import MAX_WIDTH, Picture, read_picture
+from .masks import ROWS_AT_ONCE
+from .picture import MAX_PICTURE_WIDTH, Picture, read_picture
 
-BAND = 64  # rows at a time
 # Rows: a face's right, down and forward in the camera (+x the panorama's centre, +y left, +z up).
 R_FACE_FROM_CAM = {
     letter: np.array(axes, dtype=np.float32)
@@ -37,7 +37,7 @@ R_FACE_FROM_CAM = {
 }
 Faces = dict[str, Bytes]  # by letter, (size, size, 4): RGB and 255 where valid
 MIN_FACE = 32  # [px]
-MAX_FACE = MAX_WIDTH // 4
+MAX_FACE = MAX_PICTURE_WIDTH // 4
 MAX_CUBE_FILES = 64  # a folder with more pictures is a folder of panoramas
 MAX_EMPTY_RANGE = 8  # levels within an empty cell of a cross: JPEG leaves a few
 # names that programs give to the faces r, l, u, d, f, b
@@ -68,8 +68,8 @@ def equirectangular(faces: Faces) -> Pixels:
     padded = {letter: _pad_face(faces, letter) for letter in faces}
     rgb = np.empty((2 * size, 4 * size, 3), dtype=np.uint8)
     is_valid = np.empty((2 * size, 4 * size), dtype=np.bool_)
-    for top in range(0, 2 * size, BAND):
-        rows = slice(top, top + BAND)
+    for top in range(0, 2 * size, ROWS_AT_ONCE):
+        rows = slice(top, top + ROWS_AT_ONCE)
         rays = pixel_rays(4 * size, rows).astype(np.float32)
         for left in range(0, 4 * size, size // 2):  # half a face: one face around, and up or down
             columns = slice(left, left + size // 2)

@@ -17,14 +17,17 @@ from ..geometry.colors import colors_of_edges
 from ..geometry.sphere import make_grid, pixel_rays
 from .model import Panorama, resize
 
-WIDTH = 1024  # [px] of the sphere on which gradients are taken
+GRADIENT_WIDTH = 1024  # [px] of the sphere on which gradients are taken
 DARK = 12.0  # [levels] added before the logarithm
 SMOOTHING = 0.8  # [px] before the gradient is taken
 FULL_GRADIENT = 0.25  # of the logarithm, a pixel; the strength is the root of the fraction
-VERTICAL = 0.9, 0.98  # cosine of a gradient's angle to the horizontal: no vertical edge at all, and fully
+COS_UPRIGHT_EDGE = (
+    0.9,
+    0.98,
+)  # cosine of a gradient's angle to the horizontal: no vertical edge at all, and fully
 SPREAD = 1.0  # [px] the painted edges of a scan are wide
 LEAST_COS = 0.2  # of the elevation: nearer to the poles a pixel counts as this wide
-MARGIN = 32  # [px] beyond the seam
+SEAM_MARGIN = 32  # [px] beyond the seam
 
 Pixel = TypeVar("Pixel", np.uint8, np.float32)
 AXES_WIDTH = 512  # [px] of the sphere on which axes are found
@@ -33,22 +36,26 @@ LEAST_EDGE = 1e-4  # of the gradient of the logarithm
 LEAST_EDGES = 100  # [px] fewer say nothing
 LEAST_VOTING_COS = 0.35  # of the elevation: nearer to the poles gradients are rough
 NUM_RINGS = 60  # of the grid of directions that are tried: 3 degrees apart
-ACROSS = 0.035  # cosine of the angle between an axis and a gradient that is at right angles to it, at most
+COS_ACROSS = (
+    0.035  # cosine of the angle between an axis and a gradient that is at right angles to it, at most
+)
 VOTERS = 4  # one of so many edges votes
 SHARPENINGS = 4
 SQUARE = 0.1  # cosine of the angle between two axes, at most
 
 
 def draw_edges(panorama: Panorama, R_cam_from_level: Array, has_gray: bool) -> Panorama:
-    """Return a panorama, of WIDTH, of another's edges, with its grey or without, for a known tilt (3, 3)."""
-    source = resize(panorama, WIDTH)
+    """Return a panorama of another's edges, with its grey or without, for a known tilt (3, 3)."""
+    source = resize(panorama, GRADIENT_WIDTH)
     across, down = gradients(source)
     strength = np.hypot(across, down)
-    level_across, level_down = level_directions(WIDTH, R_cam_from_level)
+    level_across, level_down = level_directions(GRADIENT_WIDTH, R_cam_from_level)
     horizontal = np.abs(level_across * across + level_down * down)
     cosine = horizontal / np.maximum(strength, 1e-9)
     strength = np.clip(np.sqrt(strength / FULL_GRADIENT), 0.0, 1.0)
-    vertical = strength * np.clip((cosine - VERTICAL[0]) / (VERTICAL[1] - VERTICAL[0]), 0.0, 1.0)
+    vertical = strength * np.clip(
+        (cosine - COS_UPRIGHT_EDGE[0]) / (COS_UPRIGHT_EDGE[1] - COS_UPRIGHT_EDGE[0]), 0.0, 1.0
+    )
     gray = mean_level(source) / np.float32(255.0) if has_gray else 0.5
     shown = find_inner(source).astype(np.float32)
     weight = np.maximum(blur(shown, SPREAD), 1e-6)
@@ -66,7 +73,7 @@ def gradients(panorama: Panorama) -> tuple[Array32, Array32]:
     """Return the derivatives (H, W) of the grey's logarithm, right and down, by pixels of the equator."""
     gray = np.log(mean_level(panorama) + np.float32(DARK))
     smooth = cv2.GaussianBlur(wrap(gray), (0, 0), SMOOTHING)
-    inner = slice(MARGIN, -MARGIN)
+    inner = slice(SEAM_MARGIN, -SEAM_MARGIN)
     right = np.asarray(cv2.Scharr(smooth, cv2.CV_32F, 1, 0)[inner, inner], np.float32) / np.float32(32.0)
     down = np.asarray(cv2.Scharr(smooth, cv2.CV_32F, 0, 1)[inner, inner], np.float32) / np.float32(32.0)
     right /= np.maximum(row_cosines(len(gray)), LEAST_COS)[:, None].astype(np.float32)
@@ -110,13 +117,18 @@ def level_directions(width: int, R_cam_from_level: Array) -> tuple[Array, Array]
 
 def blur(image: NDArray[Pixel], sigma: float) -> NDArray[Pixel]:
     """Blur an equirectangular image (H, W, ...) by a Gaussian of `sigma` [px]."""
-    return cast(NDArray[Pixel], cv2.GaussianBlur(wrap(image), (0, 0), sigma)[MARGIN:-MARGIN, MARGIN:-MARGIN])
+    return cast(
+        NDArray[Pixel],
+        cv2.GaussianBlur(wrap(image), (0, 0), sigma)[SEAM_MARGIN:-SEAM_MARGIN, SEAM_MARGIN:-SEAM_MARGIN],
+    )
 
 
 def wrap(image: NDArray[Pixel]) -> NDArray[Pixel]:
     """Return an equirectangular image (H, W, ...) with a margin on all sides, across the seam."""
-    wide = np.concatenate([image[:, -MARGIN:], image, image[:, :MARGIN]], axis=1)
-    return cast(NDArray[Pixel], cv2.copyMakeBorder(wide, MARGIN, MARGIN, 0, 0, cv2.BORDER_REPLICATE))
+    wide = np.concatenate([image[:, -SEAM_MARGIN:], image, image[:, :SEAM_MARGIN]], axis=1)
+    return cast(
+        NDArray[Pixel], cv2.copyMakeBorder(wide, SEAM_MARGIN, SEAM_MARGIN, 0, 0, cv2.BORDER_REPLICATE)
+    )
 
 
 def find_axes(panorama: Panorama) -> list[Array]:
@@ -127,7 +139,7 @@ def find_axes(panorama: Panorama) -> list[Array]:
     tried = make_grid(NUM_RINGS).directions.astype(np.float64)
     tried = tried[tried[:, 2] >= 0.0]
     some = normals[::VOTERS]
-    votes = np.array([weights[::VOTERS] @ (np.abs(some @ direction) < ACROSS) for direction in tried])
+    votes = np.array([weights[::VOTERS] @ (np.abs(some @ direction) < COS_ACROSS) for direction in tried])
     first = sharpen_axis(normals, weights, tried[np.argmax(votes)])
     votes[np.abs(tried @ first) > SQUARE] = -1.0
     second = sharpen_axis(normals, weights, tried[np.argmax(votes)])
@@ -156,7 +168,7 @@ def edge_normals(panorama: Panorama) -> tuple[Array, Array]:
 def sharpen_axis(normals: Array, weights: Array, axis: Array) -> Array:
     """Return the axis (3,) at right angles to the normals (N, 3) that nearly are, by least squares."""
     for _ in range(SHARPENINGS):
-        near = np.abs(normals @ axis) < ACROSS
+        near = np.abs(normals @ axis) < COS_ACROSS
         moments = (normals[near] * weights[near, None]).T @ normals[near]
         axis = np.linalg.eigh(moments)[1][:, 0]
     return np.asarray(axis)

@@ -22,11 +22,11 @@ from ..arrays import Array, Bytes, Mask
 from ..errors import InputError
 from ..geometry.pose import DECIMALS, R_cam_from_angles
 from .model import GPano
-from .picture import MAX_WIDTH, SPHERE_NAMESPACE as NAMESPACE, open_picture
+from .picture import MAX_PICTURE_WIDTH, SPHERE_NAMESPACE as NAMESPACE, open_picture
 
 PREFIX = re.compile(rb"xmlns:([A-Za-z_][\w.-]{0,40})\s{0,9}=\s{0,9}[\"']" + re.escape(NAMESPACE))
 FIELD = rb"\b%s:(\w{1,60})(?:\s{0,9}=\s{0,9}[\"']([^\"'<>]{0,80})[\"']|\s{0,9}>([^<>]{0,80})</)"
-MAX_NUMBER = 1e9
+MAX_GPANO_NUMBER = 1e9
 MAX_PREFIXES = 4  # of one namespace: each is a search of its own
 CROP_NAMES = "CroppedAreaLeft CroppedAreaTop CroppedAreaImageWidth CroppedAreaImageHeight"
 CROP_FIELDS = tuple(f"{name}Pixels" for name in f"{CROP_NAMES} FullPanoWidth FullPanoHeight".split())
@@ -83,7 +83,7 @@ def gpano_fields(xmp: bytes) -> dict[str, str]:
     return fields
 
 
-def _number(fields: dict[str, str], name: str, largest: float = MAX_NUMBER) -> float | None:
+def _number(fields: dict[str, str], name: str, largest: float = MAX_GPANO_NUMBER) -> float | None:
     """Return the number in a field; None if it is missing, no number, not finite or out of range."""
     try:
         value = float(fields[name])
@@ -184,8 +184,8 @@ def full_size(path: Path, region: CropRegion, size: tuple[int, int]) -> tuple[in
         raise InputError(f"{found} of a sphere of {width:.0f} x {height:.0f}, wanted that width = 2 x height")
     if region.height > 1.0 + ASPECT_TOLERANCE:
         raise InputError(f"{found}, higher than the sphere at this field of view, wanted a smaller `fov_deg`")
-    if width > MAX_WIDTH:
-        raise InputError(f"{found} of a sphere {width:.0f} wide, wanted at most {MAX_WIDTH}")
+    if width > MAX_PICTURE_WIDTH:
+        raise InputError(f"{found} of a sphere {width:.0f} wide, wanted at most {MAX_PICTURE_WIDTH}")
     if region.width * region.height < MIN_REGION:
         percent = 100.0 * region.width * region.height
         raise InputError(f"{found}, {percent:.2g} % of the sphere, wanted at least {100.0 * MIN_REGION:g} %")

@@ -12,7 +12,7 @@ from ..geometry.sphere import pixel_rays, solid_angles
 from ..geometry.vectors import row
 from ..kernels.jit import F0, F1, HALF, Scalar, copy_to, inline_kernel, kernel
 from . import Panorama
-from .texels import CHUNK, Texels, make_chunk, project, sample
+from .texels import TEXEL_CHUNK, Texels, make_chunk, project, sample
 
 CLIP = 2.0  # deviations; what differs more from its surroundings counts no more
 MIN_DEVIATION = 0.03  # of a channel in [0, 1]: flatter surroundings are not amplified further
@@ -23,7 +23,7 @@ OPPONENT = np.array([[1 / 3, 1 / 3, 1 / 3], [1 / 2, 0, -1 / 2], [-1 / 4, 1 / 2, 
 _CLIP = np.float32(CLIP)
 _MIN_VARIANCE = np.float32(MIN_DEVIATION * MIN_DEVIATION)
 STATS_WIDTH = 128  # [px] local means vary over 10 degrees and more
-LEAST_WEIGHT = np.float32(1e-9)  # of neighbours that count, where hardly any does
+LEAST_NEIGHBOR_WEIGHT = np.float32(1e-9)  # of neighbours that count, where hardly any does
 
 
 @inline_kernel
@@ -167,7 +167,7 @@ def finish_statistics(sums: Array32) -> None:
     for i in range(sums.shape[0]):
         for j in range(sums.shape[1]):
             s = sums[i, j]
-            per = F1 / max(s[0], LEAST_WEIGHT)
+            per = F1 / max(s[0], LEAST_NEIGHBOR_WEIGHT)
             for c in range(3):
                 s[1 + c], s[4 + c] = mean_and_inverse_std(s[1 + c], s[4 + c], per)
 
@@ -218,7 +218,7 @@ def normalize_panorama(panorama: Panorama, cell_deg: float, sigma_deg: float) ->
     channels = opponent_channels(panorama.rgb[rows, columns].astype(np.float32) / np.float32(255.0))
     if is_averaged:  # by a Gaussian with a cell's second moment
         sums = blur_sphere(np.dstack([channels * weight[..., None], weight]), cell_deg / math.sqrt(12.0))
-        channels = np.asarray(sums[..., :3] / np.maximum(sums[..., 3:], LEAST_WEIGHT), np.float32)
+        channels = np.asarray(sums[..., :3] / np.maximum(sums[..., 3:], LEAST_NEIGHBOR_WEIGHT), np.float32)
     inner = np.empty((len(weight) // step, weight.shape[1] // step, 7), np.float32)
     block_moments(channels, weight, inner)
     corner = rows.start, columns.start
@@ -249,8 +249,8 @@ def sample_channels(
     zero = np.float32(ZERO_LEVEL)
     axes = directions.T.copy()
     for k in range(len(rotations)):
-        for lo in range(0, len(directions), CHUNK):
-            hi = min(lo + CHUNK, len(directions))
+        for lo in range(0, len(directions), TEXEL_CHUNK):
+            hi = min(lo + TEXEL_CHUNK, len(directions))
             x = axes[0, lo:hi]
             y = axes[1, lo:hi]
             z = axes[2, lo:hi]

@@ -21,12 +21,12 @@ from .gpano import ASPECT_TOLERANCE
 from .picture import read_picture
 
 NEAR_BLACK = 8  # levels where a border goes on
-BLACK = 2  # levels that most of it has
+BLACK_LEVEL = 2  # levels that most of it has
 MIN_FULL_EDGE = 0.99  # of a full sphere's edge: its rows at the poles and its seam are black as a whole
 MIN_CROP_EDGE = 1.0 / 64.0  # of a crop's edge, which may be ragged
-MIN_PURE = 0.95  # of a border's pixels that are BLACK
+MIN_PURE = 0.95  # of a border's pixels that are BLACK_LEVEL
 RIM = 8  # [px] that JPEG smears a border's edge: a block
-BAND = 64  # rows at a time
+ROWS_AT_ONCE = 64
 
 DISC_WIDTH = 720  # [px] discs are looked for at this size, rows of half a degree; not in smaller pictures
 ROWS_PER_DEG = DISC_WIDTH / 360.0
@@ -49,7 +49,7 @@ MIN_BRIGHT_INSIDE = 0.7  # of each sector of a ring within the circle
 FISHEYE_SECTORS = 8
 MIN_ALIKE = 0.9  # correlation of the pictures of two eyes, without the mean of each row
 MIN_MASK = (16, 8)  # [px]
-WHITE = 128  # and above is to be ignored
+WHITE_LEVEL = 128  # and above is to be ignored
 
 
 def black_borders(rgb: Bytes, is_valid: Mask, is_full: bool) -> Mask | None:
@@ -59,7 +59,7 @@ def black_borders(rgb: Bytes, is_valid: Mask, is_full: bool) -> Mask | None:
     full sphere the edge must be black as a whole (a pole is one point, the seam one line), in a crop in part.
     95 % of the pixels, except a rim of 8 pixels, must be black to two levels; shadows carry noise.
     """
-    if rgb[0].max() <= BLACK and rgb.max() <= BLACK:
+    if rgb[0].max() <= BLACK_LEVEL and rgb.max() <= BLACK_LEVEL:
         return np.ones(is_valid.shape, dtype=np.bool_)
     min_fraction = MIN_FULL_EDGE if is_full else MIN_CROP_EDGE
     found = np.zeros(is_valid.shape, dtype=np.bool_)
@@ -87,8 +87,8 @@ def _filter_depths(which: Callable[..., Any], depth: Int64s) -> Int64s:
 def _depth_of_black(inwards: Bytes, is_black: Mask) -> Int64s:
     """Return the number of near black pixels from the edge (row 0) inwards, in columns black there."""
     depth = np.zeros(len(is_black), dtype=np.int64)
-    for begin in range(0, len(inwards), BAND):
-        band = np.ascontiguousarray(inwards[begin : begin + BAND])
+    for begin in range(0, len(inwards), ROWS_AT_ONCE):
+        band = np.ascontiguousarray(inwards[begin : begin + ROWS_AT_ONCE])
         is_near_black = cv2.inRange(band, (0, 0, 0), (NEAR_BLACK,) * 3) > 0
         run = np.where(is_near_black.all(axis=0), len(band), is_near_black.argmin(axis=0))
         depth += run * is_black
@@ -99,12 +99,12 @@ def _depth_of_black(inwards: Bytes, is_black: Mask) -> Int64s:
 
 
 def _black_fraction(inwards: Bytes, depth: Int64s) -> float:
-    """Return the fraction of BLACK pixels among those within `depth` (columns,) of the edge."""
+    """Return the fraction of BLACK_LEVEL pixels among those within `depth` (columns,) of the edge."""
     num_black = 0
-    for begin in range(0, int(depth.max()), BAND):
-        band = np.ascontiguousarray(inwards[begin : begin + BAND])
+    for begin in range(0, int(depth.max()), ROWS_AT_ONCE):
+        band = np.ascontiguousarray(inwards[begin : begin + ROWS_AT_ONCE])
         is_within = np.arange(begin, begin + len(band))[:, None] < depth
-        num_black += int(((cv2.inRange(band, (0, 0, 0), (BLACK,) * 3) > 0) & is_within).sum())
+        num_black += int(((cv2.inRange(band, (0, 0, 0), (BLACK_LEVEL,) * 3) > 0) & is_within).sum())
     return num_black / float(depth.sum())
 
 
@@ -226,7 +226,7 @@ def read_mask(path: Path, sizes: list[tuple[int, int]], is_black_ignored: bool =
     height, width = rgb.shape[:2]
     for k, size in enumerate(sizes):
         if abs(width * size[1] - height * size[0]) <= ASPECT_TOLERANCE * height * size[0]:
-            white = WHITE if rgb.max() > 1 else 1  # scripts write True as 1
+            white = WHITE_LEVEL if rgb.max() > 1 else 1  # scripts write True as 1
             is_white = ((rgb.max(axis=2) >= white) != is_black_ignored).astype(np.float32)
             # averages of a larger mask are above 0 where any pixel is white
             method = cv2.INTER_AREA if width > size[0] else cv2.INTER_NEAREST

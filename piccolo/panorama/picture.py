@@ -33,11 +33,13 @@ from . import radiance
 from .radiance import RadianceFile
 
 WANTED = "wanted a whole JPEG, PNG, TIFF, WebP, HEIC, AVIF or Radiance HDR picture"
-MIN_WIDTH = 128
-MIN_HEIGHT = 64
-MAX_WIDTH = 32768
-MAX_HEIGHT = 16384
-BYTES_PER_PIXEL = 12  # while a picture is decoded, turned and masked; 10 were measured, more with alpha
+MIN_PICTURE_WIDTH = 128
+MIN_PICTURE_HEIGHT = 64
+MAX_PICTURE_WIDTH = 32768
+MAX_PICTURE_HEIGHT = 16384
+PICTURE_BYTES_PER_PIXEL = (
+    12  # while a picture is decoded, turned and masked; 10 were measured, more with alpha
+)
 SPHERE_NAMESPACE = b"http://ns.google.com/photos/1.0/panorama/"
 MAX_XMP_SIZE = 1 << 20  # [byte] what is longer is left aside
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -104,7 +106,7 @@ class Picture:
         return self.rgb.shape[1], self.rgb.shape[0]
 
 
-def read_picture(path: Path, min_size: tuple[int, int] = (MIN_WIDTH, MIN_HEIGHT)) -> Picture:
+def read_picture(path: Path, min_size: tuple[int, int] = (MIN_PICTURE_WIDTH, MIN_PICTURE_HEIGHT)) -> Picture:
     """Return the picture in a file; grey becomes RGB, of 16 bits the upper 8 are kept (v >> 8).
 
     Raises InputError if the file is missing or damaged, of no format read here, or its size is out of range.
@@ -141,7 +143,7 @@ def read_labels(path: Path, labels: Labels) -> Picture:
     """
     data = read_bytes(path, WANTED)
     with open_picture(path, data) as image:
-        _check(path, image, len(data), (MIN_WIDTH, MIN_HEIGHT))
+        _check(path, image, len(data), (MIN_PICTURE_WIDTH, MIN_PICTURE_HEIGHT))
         if image.format != "PNG" or data[24:26] not in LABEL_KINDS or image.has_transparency_data:
             wanted = "wanted a PNG, grey of 8 or 16 bits or RGB of 8, without alpha"
             raise InputError(f"{path}: this kind of picture holds no labels, {wanted}")
@@ -186,11 +188,11 @@ def _check(path: Path, image: ImageFile, num_bytes: int, min_size: tuple[int, in
     found = f"{path}: found {image.width} x {image.height}"
     if longer < min_size[0] or shorter < min_size[1]:
         raise InputError(f"{found}, wanted at least {min_size[0]} x {min_size[1]}")
-    if longer > MAX_WIDTH or shorter > MAX_HEIGHT:
-        raise InputError(f"{found}, wanted at most {MAX_WIDTH} x {MAX_HEIGHT}")
+    if longer > MAX_PICTURE_WIDTH or shorter > MAX_PICTURE_HEIGHT:
+        raise InputError(f"{found}, wanted at most {MAX_PICTURE_WIDTH} x {MAX_PICTURE_HEIGHT}")
     if longer * shorter > num_bytes * MAX_PIXELS_PER_BYTE[str(image.format)]:
         raise InputError(f"{found} in a file too small for it, {WANTED}")
-    check_memory(longer * shorter * BYTES_PER_PIXEL, f"{found}, which", "make the picture smaller")
+    check_memory(longer * shorter * PICTURE_BYTES_PER_PIXEL, f"{found}, which", "make the picture smaller")
     if image.format in ("PNG", "WEBP") and getattr(image, "is_animated", False):
         raise InputError(f"{path}: the {image.format} is animated, wanted a still picture")
     tags = image.tag_v2 if isinstance(image, TiffImageFile) else {}

@@ -11,7 +11,7 @@ from PIL.ImageFile import ImageFile
 from ..geometry.colors import to_bytes
 
 MAGIC = b"#?R"  # of RADIANCE and RGBE
-HEAD_SIZE = 1 << 12  # [byte]
+RADIANCE_HEAD_SIZE = 1 << 12  # [byte]
 SIZE_LINE = re.compile(rb"\n-Y (\d{1,6}) \+X (\d{1,6})\n")  # upright, as all programs write it
 MIDDLE_GREY = 0.18  # of the light that becomes white
 EXPOSED = "HDR, exposed so that the geometric mean of its light is a middle grey; more than white is cut"
@@ -23,7 +23,7 @@ class RadianceFile(ImageFile):
     format = "HDR"
 
     def _open(self) -> None:
-        size = SIZE_LINE.search(self.fp.read(HEAD_SIZE)) if self.fp else None
+        size = SIZE_LINE.search(self.fp.read(RADIANCE_HEAD_SIZE)) if self.fp else None
         if size is None:
             raise SyntaxError("no line '-Y height +X width'")
         self._mode = "RGB"

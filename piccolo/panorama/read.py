@@ -22,7 +22,7 @@ from .gpano import ASPECT_TOLERANCE, CropRegion
 from .masks import black_borders, find_mask, is_dual_fisheye, mask_pole, polar_disc, read_mask, shows_twice
 from .model import FocalPrior, GPano, Panorama
 from .photo import elevation_deg
-from .picture import BYTES_PER_PIXEL, Picture, picture_shape, read_labels, read_picture
+from .picture import PICTURE_BYTES_PER_PIXEL, Picture, picture_shape, read_labels, read_picture
 
 Shot = tuple[Path, Picture, tuple[Mount, ...]]  # a file with the cameras that took it
 PHOTO_FOV_DEG = 65, 50  # of a phone's main camera, 24 to 28 mm on film: 63 to 72 wide, upright 50 to 57
@@ -37,7 +37,7 @@ LIKE_A_PHOTO = (
     "pinhole, for a part of a panorama `projection` equirectangular"
 )
 NO_HORIZON = "the metadata call the crop's height the sphere's: its horizon is assumed to be in the middle"
-MIN_REPORTED = 0.001  # of the sphere: borders below this are masked without a warning
+MIN_REPORTED_SHARE = 0.001  # of the sphere: borders below this are masked without a warning
 
 
 def read_panorama(photo: File | Bytes | Photo, labels: Labels | None = None) -> Panorama:
@@ -134,7 +134,7 @@ def _on_sphere(
     """
     cameras = tuple(mount for *_, mounts in shots for mount in mounts)
     width = sphere_width(cameras)
-    num_bytes = width * width // 2 * BYTES_PER_PIXEL
+    num_bytes = width * width // 2 * PICTURE_BYTES_PER_PIXEL
     check_memory(num_bytes, f"{photo.path}: the sphere of {width} x {width // 2}", "make the picture smaller")
     views: list[View] = []
     notes: list[str] = []
@@ -247,7 +247,7 @@ def _embed_and_mask(photo: Photo, picture: Picture, region: CropRegion, attitude
     if borders is not None:
         is_valid = is_valid & ~borders
         fraction = _sphere_fraction(borders, region)
-        if fraction >= MIN_REPORTED:
+        if fraction >= MIN_REPORTED_SHARE:
             notes.append(f"masked black borders: {100 * fraction:.1f} % of the sphere")
     rgb, is_valid = gpano.embed_crop(path, picture.rgb, is_valid, region)
     for pole in ("zenith", "nadir"):

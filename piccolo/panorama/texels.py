@@ -16,7 +16,7 @@ from ..geometry.sphere import direction_to_pixel, solid_angles
 from ..kernels.jit import F1, HALF, Scalar, inline_kernel, whole
 
 BYTE = np.int32(255)
-CHUNK = 512  # points
+TEXEL_CHUNK = 512  # points
 Weights = tuple[Scalar, Scalar, Scalar, Scalar]  # of four texels
 Pose32 = tuple[
     np.float32, np.float32, np.float32, np.float32, np.float32, np.float32,
@@ -112,7 +112,7 @@ def blend_with_gradient(
 
 
 class Projected(NamedTuple):
-    """A chunk of projected points, and the texels around each; arrays (CHUNK,)."""
+    """A chunk of projected points, and the texels around each; arrays (TEXEL_CHUNK,)."""
 
     x: Array32  # camera coordinates
     y: Array32
@@ -129,8 +129,8 @@ class Projected(NamedTuple):
 @inline_kernel
 def make_chunk() -> Projected:
     """Make the arrays of a chunk, not filled."""
-    f = np.empty((5, CHUNK), np.float32)
-    i = np.empty((5, CHUNK), np.int32)
+    f = np.empty((5, TEXEL_CHUNK), np.float32)
+    i = np.empty((5, TEXEL_CHUNK), np.int32)
     return Projected(f[0], f[1], f[2], f[3], f[4], i[0], i[1], i[2], i[3], i[4])
 
 
@@ -165,7 +165,7 @@ def project(
     width: int,
     projected: Projected,
 ) -> None:
-    """Write camera coordinates of at most CHUNK points (n,), and their places in an image with the texels."""
+    """Write camera coordinates of a chunk of points (n,), and their places in an image with the texels."""
     p = projected
     pose = pose_float32(R_cam_from_world, center_world)
     for n in range(len(X)):

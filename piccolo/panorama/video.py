@@ -14,8 +14,8 @@ from ..jobs.memory import check_memory
 
 SHARPNESS_WIDTH = 512  # [px] at which sharpness is judged
 NEIGHBORHOOD = 0.25  # of a step, before and after its time, in which the sharpest frame is taken
-QUALITY = 95  # of the JPEG files
-BYTES_PER_PIXEL = 20  # of frames in several stages of decoding; 19 were measured
+FRAME_QUALITY = 95  # of the JPEG files
+FRAME_BYTES_PER_PIXEL = 20  # of frames in several stages of decoding; 19 were measured
 WANTED = "wanted a video that PyAV reads, such as MP4"
 
 
@@ -98,7 +98,9 @@ def _decode(video: Path) -> Iterator[tuple[float, Any]]:
                 found = f"found {len(sizes)} videos of {stream.width} x {stream.height}, of one lens each"
                 raise InputError(f"{video}: {found}, wanted one that the camera's program has stitched")
             label = f"{video}: frames of {stream.width} x {stream.height}"
-            check_memory(stream.width * stream.height * BYTES_PER_PIXEL, label, "make the video smaller")
+            check_memory(
+                stream.width * stream.height * FRAME_BYTES_PER_PIXEL, label, "make the video smaller"
+            )
             stream.thread_type = "AUTO"
             for frame in container.decode(stream):
                 if frame.time is None:
@@ -126,5 +128,5 @@ def _measure_length(video: Path) -> float:
 def _write_frame(video: Path, folder: Path, time: float, rgb: Bytes) -> VideoFrame:
     path = folder / f"{video.stem}_{round(1000.0 * time):08d}.jpg"
     bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-    write_temporary(path, cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes())
+    write_temporary(path, cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, FRAME_QUALITY])[1].tobytes())
     return VideoFrame(time, path)

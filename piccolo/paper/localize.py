@@ -18,20 +18,20 @@ from ..geometry.sphere import solid_angles
 from ..jobs.threads import Stopwatch, Workers
 from ..judge.alternatives import Hypothesis, alternative_poses, best_distinct
 from ..judge.belief import Belief, make_belief
-from ..judge.probability import LEAST_SCORE
+from ..judge.probability import LEAST_LOGIT_SCORE
 from ..judge.result import Result, nothing_found
 from ..judge.result_parts import Alternative, Evidence
 from ..optimize.refine import DescentSettings, Loss, Refined, make_sampling_loss, refine
 from ..panorama import Panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
+from ..scan_map.camera_positions import MIN_CLEARANCE
 from ..views.zbuffer import is_free_space, render_view, visible_points
 
 # No covariance is known here, and too few alternatives to tell places that repeat: a rough guide, by margin
 # and log of the agreement, learnt without such places.
 PAPER_BIAS = -0.20
 PAPER_WEIGHTS = (6.37, 2.51)
-MIN_CLEARANCE = 0.25  # a camera is not nearer to a surface than this [m]
 PROBE_WIDTH = 48  # cells of 7.5 degrees for the two tests
 Initialization = Literal["two-stage", "loss-only"]
 
@@ -252,6 +252,6 @@ def evaluate(
 
 def paper_confidence(evidence: Evidence) -> float:
     """Return a rough, uncalibrated probability that a pose of the preset paper is right."""
-    features = evidence.margin, math.log(max(evidence.agreement, LEAST_SCORE))
+    features = evidence.margin, math.log(max(evidence.agreement, LEAST_LOGIT_SCORE))
     logit = PAPER_BIAS + sum(w * f for w, f in zip(PAPER_WEIGHTS, features, strict=True))
     return 1.0 / (1.0 + math.exp(-min(max(logit, -30.0), 30.0)))

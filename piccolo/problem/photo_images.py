@@ -29,10 +29,10 @@ from .cone import find_cone
 from .profile import ImageScale, ImageScales
 from .stages import ImageName
 
-WHOLE = 0.9  # least fraction of the sphere that a whole photo shows
+LEAST_WHOLE = 0.9  # least fraction of the sphere that a whole photo shows
 ALL_SHOWN = 0.98  # of the sphere: a photo that shows more counts as showing all cells
-BESIDE = math.radians(5.0)  # by which what is seen at a pose shifts from one pose to another near it
-ACROSS = np.diag([1.0, -1.0, 1.0])  # mirrors a camera's axes left for right
+SEEN_SHIFT = math.radians(5.0)  # by which what is seen at a pose shifts from one pose to another near it
+MIRROR = np.diag([1.0, -1.0, 1.0])  # mirrors a camera's axes left for right
 
 
 class Images(NamedTuple):
@@ -67,7 +67,7 @@ class PhotoImages:
     @property
     def is_partial(self) -> bool:
         """True if the photo shows a part of the sphere."""
-        return self.small.valid_share < WHOLE
+        return self.small.valid_share < LEAST_WHOLE
 
     def image(self, name: ImageName) -> Texels:
         """Return one of the images."""
@@ -86,7 +86,7 @@ class PhotoImages:
         """Return the cone, in the map's axes, around the cells of a grid that the photo shows."""
         if not self.is_partial:
             return EVERYWHERE
-        return self.shown().widen(BESIDE + 1.5 * math.pi / num_rings).turn(pose.R_cam_from_world.T)
+        return self.shown().widen(SEEN_SHIFT + 1.5 * math.pi / num_rings).turn(pose.R_cam_from_world.T)
 
     def mask(self, is_hidden: Mask) -> "PhotoImages":
         """Return the photo without pixels (h, 2 h), the rest normalised again."""
@@ -107,7 +107,7 @@ class PhotoImages:
             small=small,
             seen=Once(find_seen, panorama, small),
             shown=Once(find_cone, small, 0.0),
-            R_cam_from_level=ACROSS @ self.R_cam_from_level @ ACROSS,
+            R_cam_from_level=MIRROR @ self.R_cam_from_level @ MIRROR,
         )
 
     def forget(self) -> "PhotoImages":
@@ -151,7 +151,7 @@ def find_seen(panorama: Panorama, small: Texels, workers: Workers) -> Seen:
     """Find keypoints in one view around what a photo shows, or in several; of a whole photo to its sides."""
     width = panorama.rgb.shape[1]
     around = view_around(find_valid(small), width / math.tau, width)
-    several = list_sides(width) if small.valid_share >= WHOLE else cover_sphere(width)
+    several = list_sides(width) if small.valid_share >= LEAST_WHOLE else cover_sphere(width)
     views = [around] if around else several
     mask = add_margin(panorama.is_valid)
     views = [view for view in views if view.cut_mask(mask).any()]

@@ -25,13 +25,14 @@ from ..photo import NOTHING_KNOWN, Prior
 from ..scan_map.scan_map import ScanMap
 from ..views.points_around import Place, RecentViews, round_position
 from ..views.view import Cells, ViewConfig, normalize_view
-from .photo_images import ACROSS, PhotoImages, make_photo
+from .method import METHOD, Method
+from .photo_images import MIRROR, PhotoImages, make_photo
 from .profile import VIEWS, Profile, choose_profile, choose_scales
 from .stages import ViewName
 
-MAX_WIDTH = 2048  # [px] of the photo for the loss: more costs time and gains nothing
+MAX_LOSS_WIDTH = 2048  # [px] of the photo for the loss: more costs time and gains nothing
 NUM_POINTS = 30_000  # of the last descent, among those that the photo shows
-VOXEL_PER_RANGE = 1 / 150  # of points around a pose, with which the photo is compared
+AROUND_VOXEL_PER_RANGE = 1 / 150  # of points around a pose, with which the photo is compared
 COARSE_VOXEL_PER_RANGE = 1 / 40  # of coarser ones
 
 
@@ -61,6 +62,11 @@ class Problem:
     beside: tuple[Matches, ...] = ()  # with each of the photos beside this one whose poses are known
 
     @property
+    def method(self) -> Method:
+        """The numbers by which it is decided."""
+        return self.profile.method
+
+    @property
     def pixel(self) -> float:
         """Pixel [rad] of the photo as it was given, but none finer than those that are compared."""
         width: int = min(self.given.rgb.shape[1], self.photo.panorama.rgb.shape[1])
@@ -85,12 +91,12 @@ class Problem:
 
     def retake(self, panorama: Panorama) -> "Problem":
         """Return the problem of the photo as another camera took it; what it shows may lie elsewhere."""
-        fresh = prepare_problem(panorama, self.scan_map, self.prior, self.gravity)
+        fresh = prepare_problem(panorama, self.scan_map, self.prior, self.gravity, self.method)
         return fresh if self.profile.uses_matches else fresh.by_views()
 
     def mirror(self) -> "Problem":
         """Return the problem of the mirrored photo, without features of the map and the prior's heading."""
-        rotations = None if self.rotations is None else ACROSS @ self.rotations @ ACROSS
+        rotations = None if self.rotations is None else MIRROR @ self.rotations @ MIRROR
         return replace(
             self.without_map_features(),
             photo=self.photo.mirror(),
@@ -116,11 +122,15 @@ class Problem:
     def surroundings_at(self, pose: Pose) -> tuple[PackedPoints, PackedPoints]:
         """Return the points around a pose with which the photo is compared, and coarser ones."""
         around = partial(self.views.surroundings, round_position(pose))
-        return around(VOXEL_PER_RANGE), around(COARSE_VOXEL_PER_RANGE)
+        return around(AROUND_VOXEL_PER_RANGE), around(COARSE_VOXEL_PER_RANGE)
 
 
 def prepare_problem(
-    panorama: Panorama, scan_map: ScanMap, prior: Prior = NOTHING_KNOWN, gravity: Gravity = "auto"
+    panorama: Panorama,
+    scan_map: ScanMap,
+    prior: Prior = NOTHING_KNOWN,
+    gravity: Gravity = "auto",
+    method: Method = METHOD,
 ) -> Problem:
     """Prepare a panorama for the search where its prior allows; the photo may give the camera's tilt."""
     source = panorama
@@ -142,7 +152,7 @@ def prepare_problem(
         colors=Once(make_texels, panorama),
         scan_map=scan_map,
         views=make_views(scan_map),
-        profile=choose_profile(photo.small.valid_share, photo.is_partial, scan_map.has_shape),
+        profile=choose_profile(photo.small.valid_share, photo.is_partial, scan_map.has_shape, method),
         prior=prior,
         gravity=gravity,
         features=features,
@@ -166,6 +176,6 @@ def find_features(
 
 
 def make_texels(panorama: Panorama) -> Texels:
-    """Pack a panorama into texels, at most MAX_WIDTH wide."""
-    panorama = shrink(panorama, MAX_WIDTH)
+    """Pack a panorama into texels, at most MAX_LOSS_WIDTH wide."""
+    panorama = shrink(panorama, MAX_LOSS_WIDTH)
     return pack_texels(panorama.rgb, panorama.is_valid)

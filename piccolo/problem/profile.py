@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple
 from ..geometry.nearness import STARTING, STARTING_NARROW, Nearness
 from ..views.candidate_views import SEARCH_VIEW
 from ..views.view import ViewConfig
+from .method import METHOD, Method
 from .stages import FIRST, SECOND, SOFT, ImageName, Stage, ViewName
 
 # the scan's shape; its coloured views; these, and local features of the scan drawn at the pose
@@ -63,12 +64,12 @@ class DifferenceSteps(NamedTuple):
     inflation: float  # so that 95 % of true poses lie in the 95 % region (tools/benchmark.py calibration)
 
 
-STEPS = (
+COLOR_STEPS = (
     DifferenceSteps("full", math.radians(0.1), 1.1),
     DifferenceSteps("fine", math.radians(0.3), 0.36),
 )
 # of dark, noisy photos; they are too few to calibrate
-ROUGH_STEPS = DifferenceSteps("middle", math.radians(0.3), 1.0)
+ROUGH_COLOR_STEPS = DifferenceSteps("middle", math.radians(0.3), 1.0)
 # of edges, whose poses have larger errors
 SHAPE_STEPS = (
     DifferenceSteps("full", math.radians(0.5), 1.0),
@@ -86,6 +87,7 @@ class Profile:
     `of_part` and `by_shape` say what other kinds have instead.
     """
 
+    method: Method = METHOD  # the numbers by which all kinds are decided
     evidence: EvidenceKind = "drawn scan"  # with what poses are compared
     is_partial: bool = False  # the photo shows a part of the sphere
     is_narrow: bool = False  # views tell little: matches with the drawn scan, and photos beside, place it
@@ -112,8 +114,8 @@ class Profile:
     discount: float = 1.0  # of scores by shape: of few blocks chance explains more
     # geometry and errors
     fits_sphere: bool = True  # what a panorama shows of the sphere is compared with the scan
-    steps: tuple[DifferenceSteps, ...] = STEPS  # of a covariance, which is the mean by these
-    rough_steps: DifferenceSteps = ROUGH_STEPS  # if all of these are too rough
+    steps: tuple[DifferenceSteps, ...] = COLOR_STEPS  # of a covariance, which is the mean by these
+    rough_steps: DifferenceSteps = ROUGH_COLOR_STEPS  # if all of these are too rough
     own_share: float = 1.0  # of the variance by images: errors that other photos do not have in common
     has_few_blocks: bool = False  # so that their covariance is too small in the mean
     compares_halves: bool = True  # lenses stitched with an error: halves that disagree add to the covariance
@@ -179,9 +181,10 @@ PARTIAL = of_part(WHOLE)
 PROFILES = (WHOLE, PARTIAL, by_shape(WHOLE), by_shape(PARTIAL))
 
 
-def choose_profile(valid_share: float, is_partial: bool, has_shape: bool) -> Profile:
+def choose_profile(valid_share: float, is_partial: bool, has_shape: bool, method: Method = METHOD) -> Profile:
     """Return the profile of a photo that shows a share of the sphere, in a scan with colours or by shape."""
-    found = next(p for p in PROFILES if (p.is_partial, p.has_shape) == (is_partial, has_shape))
+    kind = next(p for p in PROFILES if (p.is_partial, p.has_shape) == (is_partial, has_shape))
+    found = replace(kind, method=method)
     return replace(found, discount=math.sqrt(valid_share)) if has_shape and is_partial else found
 
 

@@ -7,10 +7,10 @@ from ..arguments import MIN_CONFIDENCE, check_confidence, check_fields
 from ..errors import InputError
 from ..geometry.pose import Gravity
 from ..photo import NOTHING_KNOWN, Prior
+from .method import METHOD, Method
 
 # at most: a minute and a gigabyte for a flat, far beyond what finds more
 MOST = {"num_yaws": 3600, "num_rotations": 50_000, "max_starts": 100_000}
-FIRST_STARTS = 300  # of a brief search: few are enough for a clear photo
 
 
 class Effort(NamedTuple):
@@ -19,10 +19,12 @@ class Effort(NamedTuple):
     num_yaws: int  # rotations with gravity known
     num_rotations: int  # of SO(3), with gravity unknown
     max_starts: int  # poses from which a descent begins
+    first_starts: int = METHOD.first_starts  # the same of a brief search
 
-    def brief(self, most: int = FIRST_STARTS) -> "Effort":
+    def brief(self, most: int | None = None) -> "Effort":
         """Return that of a brief search, of at most so many starts."""
-        return self._replace(max_starts=min(most, FIRST_STARTS, self.max_starts))
+        wanted = self.first_starts if most is None else most
+        return self._replace(max_starts=min(wanted, self.first_starts, self.max_starts))
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,7 @@ class CoarseToFineSettings:
     num_rotations: int = 2000  # of SO(3), gravity unknown
     max_starts: int = 4000  # poses from which a descent begins
     min_confidence: float = MIN_CONFIDENCE  # below it a pose is not called localized
+    method: Method = METHOD  # for research: the numbers by which the method decides
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing, naming the setting."""
@@ -47,7 +50,7 @@ class CoarseToFineSettings:
     @property
     def effort(self) -> Effort:
         """The numbers of rotations and starts of a search."""
-        return Effort(self.num_yaws, self.num_rotations, self.max_starts)
+        return Effort(self.num_yaws, self.num_rotations, self.max_starts, self.method.first_starts)
 
     def to_json(self) -> dict[str, object]:
         """Return the settings as they took effect."""

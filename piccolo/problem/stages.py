@@ -20,7 +20,7 @@ class Around(NamedTuple):
 
     image: ImageName
     num_iterations: int  # on that
-    size: float  # of the perturbations, relative to PERTURBED_DISTANCE and PERTURBED_ANGLE
+    size: float  # of the perturbations, relative to `perturbed_distance` and `perturbed_angle` of the method
 
 
 class Rounds(NamedTuple):

@@ -43,28 +43,28 @@ from ..views.pictures import cut, encode_image, fill_holes
 from ..views.surfels import Surfels, render_surfels, visible_indices
 from ..views.zbuffer import View
 
-QUALITY = 80  # of JPEG
+PICTURE_QUALITY = 80  # of JPEG
 THUMB_QUALITY = 78
 THUMB_SIZE = (256, 160)
 THUMB_FOV_DEG = 100.0
-MASK_WIDTH = 1024  # [px]
+SHOWN_MASK_WIDTH = 1024  # [px]
 SCAN_WIDTH = 1024  # [px] surfels are hardly finer
 DEPTH_FROM = 0.05  # [m]
 DEPTH_TO = 1e5  # [m]
 DEPTH_STEP = 0.001  # of a range, to the next that the page can tell from it
 LEAST_PROBABILITY = 0.02  # of alternatives from which the scan is drawn
-MAX_ALTERNATIVES = 3
-MAX_WIDTH = 8192  # [px] of a sphere at full size
-GAP = 0.004  # by the width: wider gaps are marked as not scanned
+MAX_SHOWN_ALTERNATIVES = 3
+MAX_SPHERE_PICTURE = 8192  # [px] of a sphere at full size
+NOT_SCANNED_GAP = 0.004  # by the width: wider gaps are marked as not scanned
 UNSCANNED = np.array([96, 100, 106], np.float32)
 FRAME = re.compile(r"(?P<video>.+)#t=(?P<time>\d+\.\d{3})", re.DOTALL)
 # of plans
 CUT = 1.9  # [m] above the floor: below ceilings and lintels, above most furniture
 BELOW_FLOOR = 0.4  # [m] that still belongs to the storey: steps, ramps
-REACH = 5.0  # [m] around the places of a camera that is drawn
+CAMERA_REACH = 5.0  # [m] around the places of a camera that is drawn
 PIXEL = 0.02  # [m] of a plan, or more if it would be larger than
-MAX_SIDE = 3072  # [px]
-MARGIN = 0.5  # [m] around what is drawn
+MAX_PLAN_SIDE = 3072  # [px]
+PLAN_MARGIN = 0.5  # [m] around what is drawn
 FLOOR_CELL = 0.5  # [m] on which the height of the floor is looked up
 WALL_FROM = 0.6  # [m] above the floor
 WALL_BINS = 13  # what fills most of these is a wall
@@ -81,7 +81,7 @@ SHADOW_WIDTH = 0.25  # [m]
 COLUMNS = ("u", "v", "x", "y")
 WANTED = "wanted a CSV file with the columns u, v [px] and x, y [m], and two rows or more"
 MAX_OWN_SIDE = 4096  # [px]
-LEAST_SPREAD = 1e-6  # of the control points, by their distance: less is one point, or a line of three
+LEAST_CONTROL_SPREAD = 1e-6  # of the control points, by their distance: less is one point, or a line of three
 
 
 def make_pictures(
@@ -93,15 +93,15 @@ def make_pictures(
     """
     panorama = read_panorama(photo_of(result, photo), labels_of(result))
     surfels, points = scan
-    full = min(panorama.rgb.shape[1], width or MAX_WIDTH)
+    full = min(panorama.rgb.shape[1], width or MAX_SPHERE_PICTURE)
     small = shrink(panorama, full)
-    document: dict[str, Any] = {"sphere": _base64(encode_image(small.rgb, ".jpg", QUALITY))}
+    document: dict[str, Any] = {"sphere": _base64(encode_image(small.rgb, ".jpg", PICTURE_QUALITY))}
     if poses:
         view_width = min(full, SCAN_WIDTH) & ~1
         view = scan_view(surfels, poses[0], view_width)
         document["scan"] = _base64(scan_picture(view))
         document["depth"] = _base64(pack_depth(view.depth))
-        mask = occlusion_mask(points, shrink(panorama, MASK_WIDTH), poses[0])
+        mask = occlusion_mask(points, shrink(panorama, SHOWN_MASK_WIDTH), poses[0])
         document["mask"] = _base64(encode_image(mask, ".png"))
         document["alternatives"] = [
             _base64(scan_picture(scan_view(surfels, pose, view_width))) if is_shown else None
@@ -112,7 +112,7 @@ def make_pictures(
 
 def _shown(result: Result) -> list[bool]:
     """Which alternatives are worth a picture."""
-    most = MAX_ALTERNATIVES if result.status == AMBIGUOUS else 0
+    most = MAX_SHOWN_ALTERNATIVES if result.status == AMBIGUOUS else 0
     shares = [other.probability for other in result.alternatives]
     return [share >= LEAST_PROBABILITY and k < most for k, share in enumerate(shares)]
 
@@ -126,7 +126,7 @@ def scan_view(surfels: Surfels, pose: Pose, width: int) -> View:
 def scan_picture(view: View) -> bytes:
     """JPEG of a view; grey where nothing was scanned."""
     rgb = fill_holes(view.rgb, view.is_seen)
-    return encode_image(_grey_where_unscanned(rgb, view.is_seen), ".jpg", QUALITY)
+    return encode_image(_grey_where_unscanned(rgb, view.is_seen), ".jpg", PICTURE_QUALITY)
 
 
 def pack_depth(depth: Array32) -> bytes:
@@ -144,7 +144,7 @@ def pack_depth(depth: Array32) -> bytes:
 
 def _grey_where_unscanned(rgb: Bytes, is_seen: Mask) -> Bytes:
     """Return a sphere (H, W, 3) whose larger gaps (H, W) are dimmed towards grey."""
-    size = 2 * math.ceil(GAP * rgb.shape[1]) + 1
+    size = 2 * math.ceil(NOT_SCANNED_GAP * rgb.shape[1]) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     seen = np.pad(is_seen.view(np.uint8), ((0, 0), (size, size)), mode="wrap")
     closed = cv2.morphologyEx(seen, cv2.MORPH_CLOSE, disc)[:, size:-size]
@@ -214,10 +214,10 @@ def draw_plan(points: PackedPoints, places: Array, floors: Array) -> PlanImage |
     if shown is None:
         return None
     x, y, above, rgb = shown
-    width, height = np.ptp(x) + 2 * MARGIN, np.ptp(y) + 2 * MARGIN
-    pixel = max(PIXEL, float(max(width, height)) / MAX_SIDE)
-    left = float(x.min()) - MARGIN
-    top = float(y.max()) + MARGIN
+    width, height = np.ptp(x) + 2 * PLAN_MARGIN, np.ptp(y) + 2 * PLAN_MARGIN
+    pixel = max(PIXEL, float(max(width, height)) / MAX_PLAN_SIDE)
+    left = float(x.min()) - PLAN_MARGIN
+    top = float(y.max()) + PLAN_MARGIN
     columns = ((x - left) / pixel).astype(np.int64)
     rows = ((top - y) / pixel).astype(np.int64)
     shape = math.ceil(height / pixel), math.ceil(width / pixel)
@@ -231,11 +231,11 @@ def _of_storey(
     """X, y and height above the floor [m] of a storey's points below the cut, and their colours (N, 3)."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # who draws no plan need not wait for it
 
-    low, high = places[:, :2].min(axis=0) - REACH, places[:, :2].max(axis=0) + REACH
+    low, high = places[:, :2].min(axis=0) - CAMERA_REACH, places[:, :2].max(axis=0) + CAMERA_REACH
     count = np.ceil((high - low) / FLOOR_CELL).astype(np.int64) + 1
     grid = np.stack(np.meshgrid(*(np.arange(n) for n in count), indexing="ij"), axis=-1).reshape(-1, 2)
     distance, nearest = cKDTree(places[:, :2]).query(low + (grid + 0.5) * FLOOR_CELL)
-    floor = np.where(distance < REACH, floors[nearest], np.inf).reshape(count)
+    floor = np.where(distance < CAMERA_REACH, floors[nearest], np.inf).reshape(count)
     cells = np.stack([(points.x - low[0]) / FLOOR_CELL, (points.y - low[1]) / FLOOR_CELL]).astype(np.int64)
     is_inside = ((cells >= 0) & (cells < count[:, None])).all(axis=0)
     above = np.full(len(points), np.inf)
@@ -320,7 +320,7 @@ def plan_matrix(pixels: Array, places: Array) -> tuple[float, ...]:
     centred = pixels - pixels.mean(axis=0)
     spread = np.linalg.svd(centred, compute_uv=False)
     rank = 1 if len(pixels) == 2 else 2
-    if spread[rank - 1] <= LEAST_SPREAD * max(spread[0], 1.0):
+    if spread[rank - 1] <= LEAST_CONTROL_SPREAD * max(spread[0], 1.0):
         raise InputError("control points: found them in one point or on one line, wanted them far apart")
     if rank == 1:
         z, w = (complex(*(pair[1] - pair[0])) for pair in (pixels * np.array([1.0, -1.0]), places))

@@ -25,7 +25,7 @@ COLORS = {LOCALIZED: (8, 120, 76), AMBIGUOUS: (166, 83, 0), NOT_LOCALIZED: (193,
 MARKERS = {LOCALIZED: "o", AMBIGUOUS: "D", NOT_LOCALIZED: "^"}  # so that not the colour alone tells
 INK = (20, 32, 46)
 DPI = 100  # a pixel of a plan is one of the PNG
-MARGIN = 0.5  # [inch] around a plan
+PAGE_MARGIN = 0.5  # [inch] around a plan
 SIZE = 12.0  # [pt] of a mark
 FRAME_SIZE = 5.0  # [pt] of that of a walk's frame
 PATH_WIDTH = 3.5  # [pt]
@@ -110,14 +110,14 @@ def draw_shapes(document: dict[str, Any], index: int) -> Iterator[Shape]:
 def draw_figure(document: dict[str, Any], folder: Path, form: str) -> bytes:
     """Return the plans one below the other as matplotlib draws them, with a scale each."""
     plans = [(k, storey) for k, storey in enumerate(document["storeys"]) if storey["plan"]]
-    sides = [np.array([s["plan"]["width"], s["plan"]["height"]]) / DPI + MARGIN for _, s in plans]
+    sides = [np.array([s["plan"]["width"], s["plan"]["height"]]) / DPI + PAGE_MARGIN for _, s in plans]
     heights = [float(side[1]) for side in sides] or [1.0]
     size = max([float(side[0]) for side in sides] or [1.0]), sum(heights)
     figure = import_optional("`plan`", "matplotlib.figure", "plans").Figure(figsize=size, dpi=DPI)
     top = sum(heights)
     for (k, storey), (width, height) in zip(plans, sides, strict=True):
         top -= height
-        box = MARGIN / 2, top + MARGIN / 4, width - MARGIN, height - MARGIN
+        box = PAGE_MARGIN / 2, top + PAGE_MARGIN / 4, width - PAGE_MARGIN, height - PAGE_MARGIN
         axes = figure.add_axes((np.array(box) / np.tile(figure.get_size_inches(), 2)).tolist())
         _draw_plan(axes, storey, folder)
         for shape in draw_shapes(document, k):

@@ -12,21 +12,21 @@ from ..cloud.octree import Octree
 from ..errors import InputError
 from ..geometry.sphere import whole_areas
 from ..jobs.threads import Workers
-from ..views.view import BLOCK, ViewConfig, ranges_around
+from ..views.view import VIEWS_A_TASK, ViewConfig, ranges_around
 
 MIN_CLEARANCE = 0.25  # [m] a camera is not nearer to a surface
 MIN_COVERAGE = 0.55  # fraction of the sphere that shows something: flat ground or a roof alone fills half
 OPEN_COVERAGE = 0.3  # the same where hardly any place is closed in: open land
 MIN_ENCLOSED = 0.2  # fraction of the free places that are closed in, else the land counts as open
 FREE_SPACE_VIEW = ViewConfig(num_rings=12, stats_rings=12, sigma_deg=22.0, voxel_per_range=1 / 8)
-MIN_HEIGHT = 0.3  # [m] above a surface that can carry a tripod or a person
-MAX_HEIGHT = 2.4
+MIN_CAMERA_HEIGHT = 0.3  # [m] above a surface that can carry a tripod or a person
+MAX_CAMERA_HEIGHT = 2.4
 SUPPORT_RADIUS = 0.9  # [m] the floor right below a scanner is never scanned
 STOREY = 2.6  # [m] a floor is not farther below a camera
 SURFACE_VOXEL = 0.16  # [m]
 COARSE_SPACING = 0.6  # [m] of the grid; the half of it where surfaces are near
 CLEARANCE_VOXEL = 0.08  # [m]
-NEAR = 0.3  # [m] clearance below which the grid is refined
+NEAR_SURFACE = 0.3  # [m] clearance below which the grid is refined
 MAX_POSITIONS = 250_000  # looked at, and views rendered: some ten minutes on two cores, 1.9 GB
 ADVICE = (
     "the most that are searched; if its unit is not the metre, set `units`, else say where the camera was "
@@ -35,7 +35,9 @@ ADVICE = (
 BASES = 1 << 14  # cells on surfaces, around which others are supported, or centres, at a time
 LONG = 60.0  # [s] a warning says how long the views take, if more
 COST_OF_VIEW = 4.0  # time of a position's coverage and view, relative to its coverage
-REACH = math.sqrt(2.5) * COARSE_SPACING  # [m] to neighbours in the grid: across edges (sqrt 2), not corners
+GRID_REACH = (
+    math.sqrt(2.5) * COARSE_SPACING
+)  # [m] to neighbours in the grid: across edges (sqrt 2), not corners
 TUBE_RADIUS = MIN_CLEARANCE / 2.0  # [m] of a free way
 DETOUR = 1.0 / math.cos(math.pi / 8.0)  # paths along edges and across squares are at most so much longer
 
@@ -96,9 +98,9 @@ def find_supported_cells(surfaces: Array32, within: Ball | Box | None = None) ->
     if len(surfaces) == 0:
         return np.empty((0, 3), np.int64)
     base = np.floor(surfaces / s).astype(np.int64)
-    base[:, 2] = np.ceil((surfaces[:, 2] + MIN_HEIGHT) / s - 0.5)
+    base[:, 2] = np.ceil((surfaces[:, 2] + MIN_CAMERA_HEIGHT) / s - 0.5)
     around = np.arange(-reach, reach + 1)
-    layers = np.arange(int(np.ceil((MAX_HEIGHT - MIN_HEIGHT) / s)))
+    layers = np.arange(int(np.ceil((MAX_CAMERA_HEIGHT - MIN_CAMERA_HEIGHT) / s)))
     steps = np.stack(np.meshgrid(around, around, layers, indexing="ij"), axis=-1).reshape(-1, 3)
     gap = np.maximum(np.abs(steps[:, :2]) - 0.5, 0.0) * s
     steps = steps[np.hypot(gap[:, 0], gap[:, 1]) < SUPPORT_RADIUS]
@@ -124,10 +126,10 @@ def coverage(octree: Octree, centers: Floats, workers: Workers) -> Array:
     area = whole_areas(FREE_SPACE_VIEW.num_rings).astype(np.int64)
 
     def glance(lo: int) -> Array:
-        is_filled = ranges_around(octree, centers[lo : lo + BLOCK], FREE_SPACE_VIEW) > 0.0
+        is_filled = ranges_around(octree, centers[lo : lo + VIEWS_A_TASK], FREE_SPACE_VIEW) > 0.0
         return np.asarray(is_filled @ area / area.sum())
 
-    parts = workers.map(glance, range(0, len(centers), BLOCK), "find free space")
+    parts = workers.map(glance, range(0, len(centers), VIEWS_A_TASK), "find free space")
     return np.concatenate([np.empty(0), *parts])
 
 
@@ -144,7 +146,7 @@ def nearest_distances(tree: Any, centers: Floats, workers: Workers) -> Array:
 
 def warn_if_long(octree: Octree, centers: Floats, workers: Workers) -> None:
     """Estimate from a sample the time to render views from the centres (N, 3); warn if it is long."""
-    sample = centers[:: 1 + len(centers) // BLOCK]
+    sample = centers[:: 1 + len(centers) // VIEWS_A_TASK]
     alone = Workers()
     coverage(octree, sample[:1], alone)  # compiled
     begin = time.perf_counter()
@@ -176,7 +178,7 @@ def candidate_centers(octree: Octree, workers: Workers, within: Ball | Box | Non
     is_open = np.mean(fraction[is_free] > MIN_COVERAGE) < MIN_ENCLOSED if is_free.any() else False
     min_coverage = OPEN_COVERAGE if is_open else MIN_COVERAGE
     is_enclosed = fraction > min_coverage
-    is_tight = (clearance < NEAR) & (is_enclosed | ~is_free)
+    is_tight = (clearance < NEAR_SURFACE) & (is_enclosed | ~is_free)
     kept = middle[~is_tight & is_free & is_enclosed]
 
     # Nothing of a cell is free if its centre is deeper in a surface than the cell is wide.
@@ -244,7 +246,7 @@ class FreeSpace:
             distance = nearest_distances(surfaces, places, self.workers)
             return np.sqrt(np.maximum(distance**2 - TUBE_RADIUS**2, 0.0))
 
-        pairs = self._tree.query_pairs(REACH, output_type="ndarray")
+        pairs = self._tree.query_pairs(GRID_REACH, output_type="ndarray")
         length = np.linalg.norm(centers[pairs[:, 0]] - centers[pairs[:, 1]], axis=1)
         uncovered = length - covered(centers)[pairs].sum(axis=1)
         some = uncovered > 0.0

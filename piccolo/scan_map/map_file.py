@@ -71,11 +71,11 @@ LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "crs": ("|u1", ("characters",)),  # UTF-8
 }
 SHA256 = re.compile("[0-9a-f]{64}")
-ROUNDING = 1e-9  # of a rotation
+ROTATION_ROUNDING = 1e-9  # of a rotation
 LEAF_SIZES = 1e-3, 0.1  # [m] least and most
 FARTHEST_ORIGIN = 1e12  # [m] of the world
-MARGIN = 10.0  # [m] around the voxels that are kept
-BRIGHTEST = np.float32(1.0 + 1e-6)
+VOXEL_MARGIN = 10.0  # [m] around the voxels that are kept
+BRIGHTEST_COLOR = np.float32(1.0 + 1e-6)
 LARGEST_DEVIATION = 1.0  # [m] of points from their surfaces
 FARTHEST_LAYERS = 0.2, 1.0  # [rad] and [m] about and along any axis
 MAX_CRS = 4 * 20_000  # [byte]
@@ -94,7 +94,7 @@ def is_in_range(node: Array32, reach: float) -> bool:
     """Return True if a node (6,) is within `reach` of zero along each axis and has a valid colour."""
     is_one = True
     for k in range(3):
-        is_one = is_one and abs(node[k]) <= reach and F0 <= node[3 + k] <= BRIGHTEST
+        is_one = is_one and abs(node[k]) <= reach and F0 <= node[3 + k] <= BRIGHTEST_COLOR
     return is_one
 
 
@@ -152,18 +152,18 @@ def _refuse(path: Path, found: str) -> None:
 
 def _reach(arrays: Arrays) -> float:
     """Return the largest distance [m] of points in a map from the origin along an axis."""
-    return WINDOW * float(arrays["octree_leaf_size"]) + MARGIN
+    return WINDOW * float(arrays["octree_leaf_size"]) + VOXEL_MARGIN
 
 
 def _check_frame(path: Path, arrays: Arrays) -> None:
     """Check the rotation and the variance, and that the origin is at whole metres of the map's axes."""
-    R = check_rotation(arrays["R_map_from_world"], ROUNDING, f"{path}: R_map_from_world of the map")
+    R = check_rotation(arrays["R_map_from_world"], ROTATION_ROUNDING, f"{path}: R_map_from_world of the map")
     origin: Array = arrays["origin_world"]
     if not (np.abs(origin).max() < FARTHEST_ORIGIN and np.abs(R @ origin - np.rint(R @ origin)).max() < 1e-3):
         _refuse(path, f"an origin_world of {origin.tolist()}")
     T: Array = arrays["surface_variance"]
-    is_one = np.isfinite(T).all() and np.allclose(T, T.T, rtol=0.0, atol=ROUNDING)
-    if not (is_one and -ROUNDING <= np.linalg.eigvalsh(T)[0] <= np.trace(T) <= LARGEST_DEVIATION**2):
+    is_one = np.isfinite(T).all() and np.allclose(T, T.T, rtol=0.0, atol=ROTATION_ROUNDING)
+    if not (is_one and -ROTATION_ROUNDING <= np.linalg.eigvalsh(T)[0] <= np.trace(T) <= LARGEST_DEVIATION**2):
         _refuse(path, f"a surface_variance of {T.tolist()}")
 
 
@@ -219,7 +219,7 @@ def _check_features(path: Path, arrays: Arrays) -> None:
     points = arrays["local_points"]
     sizes = arrays["local_sizes"]
     start = arrays["local_list_start"]
-    if not np.abs(points).max(initial=F0) <= _reach(arrays) + MARGIN + MAX_RANGE:
+    if not np.abs(points).max(initial=F0) <= _reach(arrays) + VOXEL_MARGIN + MAX_RANGE:
         _refuse(path, "a feature at no finite place or too far away")
     if not (sizes.min(initial=F1) > F0 and sizes.max(initial=F0) <= MAX_RANGE):
         _refuse(path, f"features of {sizes.min()} to {sizes.max()} m")

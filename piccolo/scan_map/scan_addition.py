@@ -19,11 +19,11 @@ from ..geometry.sphere import whole_areas
 from ..jobs.threads import Stopwatch, Workers
 from ..local_features.feature_map import MOST_VIEWS, FeatureMap, extend_feature_map, view_positions
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, WideViews, render_wide
-from ..views.view import BLOCK, ranges_around
+from ..views.view import VIEWS_A_TASK, ranges_around
 from .camera_positions import CLEARANCE_VOXEL, MIN_CLEARANCE, Box, candidate_centers
 from .scan_map import ScanMap, check_name, look_for_layers, make_range_lookup, sparse_candidates
 
-REACH = 3.0  # [m] beside the new scan there may be new places for a camera
+BESIDE_SCAN = 3.0  # [m] beside the new scan there may be new places for a camera
 NEARER = 0.9  # of two scans the one in front is nearer by this
 # Fractions of the sphere in which a view shows the new scan, else it stays, or its features do: what they
 # miss, new views have from nearer.
@@ -105,7 +105,7 @@ def join_candidates(old: ScanMap, new: Octree, octree: Octree, workers: Workers)
     points = new.level(CLEARANCE_VOXEL)[:, :3]
     clearance, _ = cKDTree(points).query(old.centers, distance_upper_bound=2.0 * MIN_CLEARANCE)
     rows = np.flatnonzero(clearance > MIN_CLEARANCE)
-    box = Box(points.min(axis=0) - REACH, points.max(axis=0) + REACH)
+    box = Box(points.min(axis=0) - BESIDE_SCAN, points.max(axis=0) + BESIDE_SCAN)
     positions = candidate_centers(octree, workers, box)
     gap, _ = cKDTree(old.centers).query(positions)
     more = positions[box.holds(positions) & (gap > 0.0)]
@@ -135,13 +135,13 @@ def compare_ranges(new: Octree, old: Octree, centers: Array, workers: Workers) -
     area = whole_areas(SEARCH_VIEW.num_rings).astype(np.float64)
 
     def compare(lo: int) -> tuple[Array, Array]:
-        some = centers[lo : lo + BLOCK]
+        some = centers[lo : lo + VIEWS_A_TASK]
         of_new, of_old = (ranges_around(octree, some, SEARCH_VIEW) for octree in (new, old))
         of_new[of_new == 0.0] = np.inf
         of_old[of_old == 0.0] = np.inf
         return (of_new < NEARER * of_old) @ area, (of_old < NEARER * of_new) @ area
 
-    parts = list(workers.map(compare, range(0, len(centers), BLOCK), "compare views"))
+    parts = list(workers.map(compare, range(0, len(centers), VIEWS_A_TASK), "compare views"))
     in_front, behind = (np.concatenate([np.empty(0), *(part[k] for part in parts)]) for k in range(2))
     return in_front / area.sum(), behind / area.sum()
 

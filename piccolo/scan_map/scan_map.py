@@ -29,7 +29,7 @@ LOG = logging.getLogger("piccolo")
 SHAPE_ALONE = "photos are localized by the shape of the scan, without colours"
 LEAST_DEVIATION = 0.004  # of luminance, by rounding colours to 8 bits
 MAX_TILT = np.radians(5.0)  # of the floors to the axis taken for up; a larger one is warned of
-MAX_NAME = 100  # characters
+MAX_SCAN_NAME = 100  # characters
 MAX_SCANS = 1000  # of a map
 
 
@@ -275,13 +275,13 @@ def defer_features(scan_map: ScanMap) -> ScanMap:
 
 def is_name(name: str) -> bool:
     """Return True for one line of text that can be printed."""
-    return 1 <= len(name) <= MAX_NAME and name.isprintable() and name == name.strip()
+    return 1 <= len(name) <= MAX_SCAN_NAME and name.isprintable() and name == name.strip()
 
 
 def check_name(name: str, taken: Sequence[str]) -> None:
     """Refuse an invalid or duplicate name of a scan, or one scan too many."""
     if not is_name(name):
-        raise InputError(f"`name`: found {name[:200]!r}, wanted 1 to {MAX_NAME} printable characters")
+        raise InputError(f"`name`: found {name[:200]!r}, wanted 1 to {MAX_SCAN_NAME} printable characters")
     if name in taken:
         raise InputError(f"`name`: found {name!r}, which the map has already: {_list_names(taken)}")
     if len(taken) >= MAX_SCANS:

@@ -7,22 +7,22 @@ import numpy as np
 
 from ..arrays import Array, Array32, Int64s, Mask
 from ..cloud.octree import Octree
-from ..cloud.soa import FARTHEST
+from ..cloud.soa import FARTHEST_POINT
 from .camera_positions import SURFACE_VOXEL
 
-HEADROOM = 11  # voxels above a surface that are empty, 1.8 m
+HEADROOM_VOXELS = 11  # voxels above a surface that are empty, 1.8 m
 THICKNESS = 1  # voxels up and down that are of one floor: noise, thresholds, ramps
-OPENING = 5  # [voxels] width of the disc that fits on a floor, 0.8 m: on shelves and steps it does not
+FLOOR_OPENING = 5  # [voxels] width of the disc that fits on a floor, 0.8 m: on shelves and steps it does not
 LEAST_AREA = 3.0  # of a storey's floor [m2]
 LEAST_FRACTION = 0.15  # of the largest floor's area
-LEAST_APART = 2.3  # [m] between the floors of two storeys
+LEAST_STOREY_HEIGHT = 2.3  # [m] between the floors of two storeys
 LEAST_ABOVE = 1.0  # voxels a m2 of walls or furniture above a floor: a ceiling from above has none
 LEAST_OVERLAP = 0.15  # of the smaller floor; below, two are one storey on a slope or in two wings
 # [m] below and above a storey's levels lie its surfaces; farther below is the ceiling of the next one
 BELOW_LEVEL = 0.25
 ABOVE_LEVEL = 0.5
-GAP = 17  # [voxels] of a floor that furniture hid from the scanner, 2.7 m
-BESIDE = 1.5  # [m] a camera may be from the nearest scanned floor of its storey
+FLOOR_GAP = 17  # [voxels] of a floor that furniture hid from the scanner, 2.7 m
+MOST_BESIDE_FLOOR = 1.5  # [m] a camera may be from the nearest scanned floor of its storey
 FIRST_REACH = 1.0  # [m] around a place, in which surfaces are looked for first
 NUM_NEAREST = 40  # surfaces around a place, 0.6 m
 LOW = 10.0  # percentile of them that is the floor
@@ -45,7 +45,7 @@ class Storey(NamedTuple):
             begin, end = np.searchsorted(x, np.array([center[0] - reach, center[0] + reach], np.float32))
             near = self.surfaces[begin:end]
             distance = np.hypot(near[:, 0] - center[0], near[:, 1] - center[1])
-            if np.count_nonzero(distance <= reach) >= count or reach > FARTHEST or len(near) == len(x):
+            if np.count_nonzero(distance <= reach) >= count or reach > FARTHEST_POINT or len(near) == len(x):
                 order = np.argsort(distance, kind="stable")[:count]
                 return distance[order], near[order, 2].astype(np.float64)
             reach *= 2.0
@@ -68,7 +68,7 @@ class Storeys(NamedTuple):
         for k, one in enumerate(self.storeys):
             found = [one.nearest(center, NUM_NEAREST) for center in centers]
             above = centers[:, 2] - [np.percentile(heights, LOW) for _, heights in found]
-            is_near = np.array([distance[0] < BESIDE for distance, _ in found], np.bool_)
+            is_near = np.array([distance[0] < MOST_BESIDE_FLOOR for distance, _ in found], np.bool_)
             is_better = (above > 0.0) & (is_near | ~is_sure) | (storey < 0)
             storey[is_better] = k
             height[is_better] = above[is_better]
@@ -99,12 +99,14 @@ def find_storeys(octree: Octree) -> Storeys:
 
 def _is_standable(ijk: Int64s) -> Mask:
     """Return a mask (N,) of the voxels (N, 3) with room for a person above them."""
-    shape = ijk.max(axis=0, initial=0) + HEADROOM + 2
+    shape = ijk.max(axis=0, initial=0) + HEADROOM_VOXELS + 2
     code = (ijk[:, 0] * shape[1] + ijk[:, 1]) * shape[2] + ijk[:, 2]
     order = np.argsort(code)
-    following = np.append(np.diff(code[order]), HEADROOM + 1)  # voxels to the next one above, or beyond it
+    following = np.append(
+        np.diff(code[order]), HEADROOM_VOXELS + 1
+    )  # voxels to the next one above, or beyond it
     is_free = np.empty(len(code), np.bool_)
-    is_free[order] = following > HEADROOM
+    is_free[order] = following > HEADROOM_VOXELS
     return is_free
 
 
@@ -112,7 +114,8 @@ def _find_levels(ijk: Int64s, tops: Int64s) -> dict[int, Mask]:
     """Find the floors by their height [voxels], ascending, with the cells (I, J) of each.
 
     `ijk` (N, 3) are all voxels, `tops` those with room above. The largest floor is taken first, then those
-    that are LEAST_APART from others or overlap them little. Floors on which nothing stands are left out.
+    that are LEAST_STOREY_HEIGHT from others or overlap them little. Floors on which nothing stands are left
+    out.
     """
     if not len(tops):
         return {}
@@ -125,7 +128,7 @@ def _find_levels(ijk: Int64s, tops: Int64s) -> dict[int, Mask]:
         level = around.start + int(counts[around].argmax())
         mask = _open_level(ijk, tops, level)
         is_apart = all(
-            abs(level - other) * SURFACE_VOXEL >= LEAST_APART or _overlap(mask, below) < LEAST_OVERLAP
+            abs(level - other) * SURFACE_VOXEL >= LEAST_STOREY_HEIGHT or _overlap(mask, below) < LEAST_OVERLAP
             for other, below in found.items()
         )
         if is_apart and mask.sum() > most and _has_things_above(ijk, level, mask):
@@ -141,21 +144,21 @@ def _open_level(ijk: Int64s, tops: Int64s, level: int) -> Mask:
     own = tops[np.abs(tops[:, 2] - level) <= THICKNESS]
     mask[own[:, 0], own[:, 1]] = 1
     closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (OPENING, OPENING))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (FLOOR_OPENING, FLOOR_OPENING))
     return np.asarray(cv2.morphologyEx(closed, cv2.MORPH_OPEN, disc) > 0)
 
 
 def _has_things_above(ijk: Int64s, level: int, mask: Mask) -> bool:
     """Return True if anything is on a floor or around it."""
-    wide = cv2.dilate(mask.astype(np.uint8), np.ones((OPENING, OPENING), np.uint8))
-    is_above = (ijk[:, 2] > level + THICKNESS) & (ijk[:, 2] <= level + HEADROOM)
+    wide = cv2.dilate(mask.astype(np.uint8), np.ones((FLOOR_OPENING, FLOOR_OPENING), np.uint8))
+    is_above = (ijk[:, 2] > level + THICKNESS) & (ijk[:, 2] <= level + HEADROOM_VOXELS)
     count = wide[ijk[is_above, 0], ijk[is_above, 1]].sum()
     return bool(count >= LEAST_ABOVE * mask.sum() * SURFACE_VOXEL**2)
 
 
 def _overlap(mask: Mask, other: Mask) -> float:
     """Return the fraction of the smaller of two floors that overlaps the other or a gap in it."""
-    square = np.ones((GAP, GAP), np.uint8)
+    square = np.ones((FLOOR_GAP, FLOOR_GAP), np.uint8)
     one, two = (cv2.morphologyEx(m.astype(np.uint8), cv2.MORPH_CLOSE, square) > 0 for m in (mask, other))
     return float((one & two).sum() / max(min(one.sum(), two.sum()), 1))
 

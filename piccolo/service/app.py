@@ -38,7 +38,7 @@ from .keep import Keep
 
 LOG = logging.getLogger(__name__)
 MAX_OPTIONS = 1 << 16  # [byte] of the options' text
-MAX_PARTS = 8  # of a form: more are not read, to say which is wrong
+MAX_FORM_PARTS = 8  # of a form: more are not read, to say which is wrong
 SETTLED_S = 1.0  # [s] for which the files of a scan must not change before they are opened again
 LINES = "application/x-ndjson"
 UNBUFFERED = {"X-Accel-Buffering": "no"}  # nginx: a line is sent on at once
@@ -247,7 +247,7 @@ class Service:
 @asynccontextmanager
 async def reading_form(request: Request) -> AsyncIterator[FormData]:
     """Yield the form that was sent; HTTPException for a torn one, which says what to send."""
-    limits = {"max_files": MAX_PARTS, "max_fields": MAX_PARTS, "max_part_size": MAX_OPTIONS}
+    limits = {"max_files": MAX_FORM_PARTS, "max_fields": MAX_FORM_PARTS, "max_part_size": MAX_OPTIONS}
     try:
         form = await request.form(**limits)
     except HTTPException as error:

@@ -19,7 +19,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from ..jobs.memory import allow_files
 
 STALL_S = 20.0  # [s] for the headers of a request, and for each step of its body
-STEP = 1 << 14  # [byte] of a body
+BODY_STEP = 1 << 14  # [byte] of a body
 LOOK_S = 1.0  # [s] between looks at a connection that may have stalled
 BACKLOG = 32  # connections accepted before the first of them is counted
 FILES = 64 + BACKLOG  # that are open beside those of connections
@@ -70,7 +70,7 @@ class Connection(H11Protocol):
         before = self.cycle
         super().data_received(data)
         self.num_bytes += len(data)
-        is_step = self.num_bytes >= STEP and self.cycle is not None
+        is_step = self.num_bytes >= BODY_STEP and self.cycle is not None
         if is_step or self.cycle is not before or not self.is_awaited:
             self.get_on()
 

@@ -22,7 +22,6 @@ from ..judge.by_others import believe_beside
 from ..judge.conclude import take_pose
 from ..judge.pose_covariance import PoseCovariance
 from ..judge.result import Result, nothing_found
-from ..judge.selection import SURE_MATCHES
 from ..local_features.hypotheses import exact_pose, propose_poses
 from ..local_features.matching import Matches
 from ..localization.attempts import add_verified
@@ -31,6 +30,7 @@ from ..localization.last_descent import refine_best
 from ..localization.localize import fit_camera
 from ..localization.means import Means
 from ..panorama import Panorama
+from ..problem.method import Method
 from ..problem.prior import apply_prior
 from ..problem.problem import Problem, prepare_problem
 from ..problem.settings import CoarseToFineSettings
@@ -90,7 +90,7 @@ def localize_beside(
     """
     allowed_map = apply_prior(scan_map, settings.prior)
     with watch.stage("match"):
-        problem = prepare_problem(panorama, allowed_map, settings.prior, settings.gravity)
+        problem = prepare_problem(panorama, allowed_map, settings.prior, settings.gravity, settings.method)
         is_asked = problem.profile.is_narrow and len(allowed_map.sparse) > 0
         asked = list(pictures.items()) if is_asked else []
         matched = filter(None, workers.map(partial(match_picture, problem, workers), asked, "match"))
@@ -106,7 +106,7 @@ def localize_beside(
         if isinstance(ended.fit, FocalFit):  # the photo beside confirms the pose
             ended = ended._replace(fit=ended.fit._replace(of_picture=None))
         judged = judge(ended, means, settings.min_confidence)
-        kept = list_agreeing(judged, found, ended.problem.beside, scan_map)
+        kept = list_agreeing(ended.problem.method, judged, found, ended.problem.beside, scan_map)
         if not kept:
             return nothing_found(), ()
         within = None
@@ -119,7 +119,11 @@ def localize_beside(
 
 
 def list_agreeing(
-    judged: Result, found: Sequence[Neighbor], matches: Sequence[Matches], scan_map: ScanMap
+    method: Method,
+    judged: Result,
+    found: Sequence[Neighbor],
+    matches: Sequence[Matches],
+    scan_map: ScanMap,
 ) -> list[Neighbor]:
     """List the photos whose matches (rays by the final camera) put a photo where it is by all evidence."""
     if judged.best_pose is None:
@@ -128,7 +132,7 @@ def list_agreeing(
     agreeing = []
     for other, turned in zip(found, matches, strict=True):
         exact = exact_pose(turned, own)
-        if exact and exact.num_matches >= SURE_MATCHES and CONFIRMED.holds(exact.pose, own):
+        if exact and exact.num_matches >= method.sure_matches and CONFIRMED.holds(exact.pose, own):
             agreeing.append(other._replace(matches=turned, pose=exact.pose))
     return agreeing
 
@@ -159,8 +163,9 @@ def match_picture(
     """
     name, picture = named
     matches = match_beside(problem, picture.located, workers)
-    found = propose_poses(matches, 1, workers) if len(matches.query) >= SURE_MATCHES else []
-    if not found or found[0].num_matches < SURE_MATCHES:
+    least = problem.method.sure_matches
+    found = propose_poses(matches, 1, workers) if len(matches.query) >= least else []
+    if not found or found[0].num_matches < least:
         return None
     return Neighbor(name, picture, matches, found[0].pose), found[0].num_matches
 

@@ -32,7 +32,7 @@ from ..panorama import Panorama
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
 from .bundle_adjustment import (
-    NUM_ROUNDS,
+    NUM_ADJUSTMENT_ROUNDS,
     Adjusted,
     Bundle,
     Estimate,
@@ -52,15 +52,15 @@ from .bundle_search import (
 )
 from .members import Member, find_members
 
-EVEN = 0.5
+EVEN_ODDS = 0.5
 LOCAL_ERRORS = np.diag(np.repeat([math.radians(2.0) ** 2, 0.15**2], 3))  # chosen: of local optima, [rad, m]
-NUM_NEIGHBORS = 8  # chosen: photos whose relative pose another may have by mistake
+NUM_EXCHANGED = 8  # chosen: photos whose relative pose another may have by mistake
 MOST_GAIN = 3.0  # [log] by being where it was to be expected
 TOLD = 2.0  # deviations of the scale, and ratio of other errors to those expected, that are reported
 NOT_FOUND = "`relative_poses`: no pose of all photos together was found"
 DOUBTED = "`relative_poses`: they contradict the photos that are sure; only these keep their poses"
 UNSEEN = "`relative_poses`: this photo does not show the place where the others put it"
-CONTRADICTS = "`relative_poses`: this photo contradicts the others; it is judged by itself"
+CONTRADICTS_OTHERS = "`relative_poses`: this photo contradicts the others; it is judged by itself"
 
 
 class Agreed(NamedTuple):
@@ -109,7 +109,7 @@ def judge_members(
             supports[k] = find_support(member, problem, bundle.place(member.cam_from_bundle), workers)
     probabilities = weigh_bundles([list(supports.values()) for supports in tested], list(members.values()))
     best = int(probabilities[:-1].argmax()) if bundles else 0
-    if not bundles or probabilities[best] < EVEN:
+    if not bundles or probabilities[best] < EVEN_ODDS:
         is_any_sure = any(member.alone.status == LOCALIZED for member in members.values())
         reason = DOUBTED if is_any_sure and len(members) > 1 else NOT_FOUND
         return {k: refuse(member, reason) for k, member in members.items()}
@@ -142,7 +142,7 @@ def judge_members(
 def list_neighbors(members: dict[int, PosedMember], k: int) -> list[Pose]:
     """Return the relative poses of the photos next to one in order, which may be its own by mistake."""
     others = sorted((j for j in members if j != k), key=lambda j: abs(j - k))
-    return [members[j].cam_from_bundle for j in others[:NUM_NEIGHBORS]]
+    return [members[j].cam_from_bundle for j in others[:NUM_EXCHANGED]]
 
 
 def agree(
@@ -194,7 +194,7 @@ def blur_local(
     probabilities are found in turn (expectation maximization).
     """
     shares = local_shares
-    for _ in range(NUM_ROUNDS):
+    for _ in range(NUM_ADJUSTMENT_ROUNDS):
         blurred = {
             k: Estimate(one.own.blur(shares[k] * LOCAL_ERRORS), one.cam_from_bundle) for k, one in own.items()
         }
@@ -274,15 +274,15 @@ def judge_member(
     if member.alone.belief.ruled_out and not member.is_misplaced:
         return replace(member.alone, warnings=member.alone.warnings + agreed.warnings)
     belongs = Shares(*support.shares[:2].tolist())
-    if belongs.here < EVEN or number in agreed.apart:
-        return judge_apart(member, CONTRADICTS)
+    if belongs.here < EVEN_ODDS or number in agreed.apart:
+        return judge_apart(member, CONTRADICTS_OTHERS)
     placed = place_member(member, number, belongs, agreed)
     if placed.gaussian is None:
         return refuse(member, NOT_FOUND)
     places = [bundle.place(member.cam_from_bundle) for bundle in elsewhere]
     is_agreed = number in agreed.estimates
     result = judge_placed(member, support, placed, is_agreed, places, probabilities, means, min_confidence)
-    doubts = (UNSEEN,) if placed.shares.right < EVEN else ()
+    doubts = (UNSEEN,) if placed.shares.right < EVEN_ODDS else ()
     return replace(result, warnings=result.warnings + doubts + agreed.warnings)
 
 

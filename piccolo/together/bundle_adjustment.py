@@ -20,9 +20,9 @@ from ..optimize.gauss_newton import Equations, minimize, sum_observations, white
 RelativeScale = Literal["metres", "unknown"]  # of the positions of relative poses
 UNKNOWN_SCALE = 10.0  # deviation of the logarithm of a scale that is not known
 NUM_ADJUSTMENTS = 6  # steps, at most
-SETTLED = 1e-6  # [rad, m] of a step, after which there is none
-NUM_ROUNDS = 4  # in which errors of relative poses and the bundle are estimated in turn
-TELLING = 10.0  # ratio of variances (F) by which one photo differs from the others: it contradicts them
+BUNDLE_SETTLED = 1e-6  # [rad, m] of a step, after which there is none
+NUM_ADJUSTMENT_ROUNDS = 4  # in which errors of relative poses and the bundle are estimated in turn
+TELLING_RATIO = 10.0  # ratio of variances (F) by which one photo differs from the others: it contradicts them
 MEDIAN = 2.366  # of chi square of 3
 QUANTILE = 1.645  # deviations of the normal distribution below which 95 % lie
 
@@ -106,7 +106,7 @@ def adjust(bundle: Bundle, estimates: Sequence[Estimate], errors: RelativeErrors
     def move(at: Bundle, step: Array) -> Bundle:
         return Bundle(add(at.pose, step[:6]), at.log_scale + float(step[6]))
 
-    adjusted, found = minimize(equations, move, bundle, NUM_ADJUSTMENTS, SETTLED)
+    adjusted, found = minimize(equations, move, bundle, NUM_ADJUSTMENTS, BUNDLE_SETTLED)
     common = mean_of([own.common for own, _ in estimates])
     return Adjusted(adjusted, np.asarray(np.linalg.inv(found.matrix)), common)
 
@@ -141,7 +141,7 @@ def estimate_errors(bundle: Bundle, estimates: Sequence[Estimate], errors: Relat
     From few photos a variance is taken larger: chi square / (freedom - 2), as by Student's t.
     """
     freedom = count_freedom(len(estimates))
-    for _ in range(NUM_ROUNDS):
+    for _ in range(NUM_ADJUSTMENT_ROUNDS):
         squares = sum_squares(adjust(bundle, estimates, errors).bundle, estimates, errors)
         factors = [
             math.sqrt(max(square / max(free - 2.0, 1.0), 1.0)) if square > find_limit(free) else 1.0
@@ -208,7 +208,7 @@ def find_contradicting(bundle: Bundle, estimates: Sequence[Estimate], errors: Re
     ]
     best = int(np.argmin(rest))
     left = max(rest[best] / float(count_freedom(len(estimates) - 1).sum()), 1.0)
-    return best if (total - rest[best]) / 6.0 > TELLING * left else None
+    return best if (total - rest[best]) / 6.0 > TELLING_RATIO * left else None
 
 
 def squares_at_best(bundle: Bundle, estimates: Sequence[Estimate], errors: RelativeErrors) -> float:

@@ -19,7 +19,7 @@ from ..jobs.threads import Workers
 from ..judge.by_others import LEAST_NONE
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Errors
-from ..judge.probability import CONTRADICTED, posterior
+from ..judge.probability import CONTRADICTED_ODDS, posterior
 from ..judge.selection import assess
 from ..localization.ladder import refine
 from ..localization.last_descent import HOPELESS_SCORE
@@ -31,10 +31,10 @@ from .members import Member
 MISSED = 0.25  # chosen: of photos, those without a right pose found (of BENCHMARK.md's phone photos a sixth)
 MOST_UNSEEN = 1.0 / 3.0  # chosen: of photos, those that may show nothing
 SILENT = 0.05  # chosen: of photos of the bundle, those that show nothing of their place
-CHANCE = 0.02  # chosen: probability that a photo has a pose near that by a wrong pose of the bundle
+CHANCE_NEAR = 0.02  # chosen: probability that a photo has a pose near that by a wrong pose of the bundle
 NUM_BUNDLES = 4  # poses of the bundle that are tested
 SCALES = 0.5, 2.0  # of positions in metres that are proposed, so that a wrong scale is seen
-LEAST_APART = 0.5  # [m] photos nearer to each other say nothing of the scale
+LEAST_DISTANCE = 0.5  # [m] photos nearer to each other say nothing of the scale
 NUM_LIKELY = 2  # poses of a photo that propose a scale, those with the most probability
 
 
@@ -55,7 +55,7 @@ class Support(NamedTuple):
     odds_elsewhere: float  # of the places of the photo's other poses
     num_places: int  # of the scan where a photo alone may be
     odds_exchanged: float = 0.0  # of the places of other photos of the bundle, in the mean
-    belongs: float = 1.0 - CONTRADICTED  # probability beforehand that it is where others expect it
+    belongs: float = 1.0 - CONTRADICTED_ODDS  # probability beforehand that it is where others expect it
     weight: float = 1.0  # of this evidence, less if other photos show the same
 
     def miss(self) -> "Support":
@@ -124,7 +124,7 @@ def propose_with_scale(
     if angle_between(relative.R_cam_from_world, found.R_cam_from_world) > ONE_IN_BUNDLE.angle:
         return []
     is_free = errors.log_scale > 1.0
-    if found_apart < LEAST_APART or given_apart <= 0.0:
+    if found_apart < LEAST_DISTANCE or given_apart <= 0.0:
         return []
     scale = found_apart / given_apart
     if not is_free and not SCALES[0] < scale < SCALES[1]:
@@ -182,7 +182,7 @@ def find_support(
         counted = ranked[k] if is_counted else count_agreeing(problem, ranked[k], workers)
         errors = estimate_errors(problem, counted, workers)
         errors = errors.widen(fit.pose_covariance) if fit else errors
-    p = posterior(assess(problem.profile, selection), errors.std_of_fit)
+    p = posterior(assess(problem.profile, selection), errors.std_of_fit, problem.method)
     none = max(float(p[-1]), LEAST_NONE)
     odds_elsewhere = float(p[:-1].sum() - p[k]) / none
     num_places = len(problem.scan_map.sparse)
@@ -215,14 +215,14 @@ def weigh_bundles(tested: Sequence[Sequence[Support]], members: Sequence[Member]
     for of_one in tested:
         odds_of_seen = sorted(s.odds for s in of_one)[int(len(of_one) * MOST_UNSEEN) :]
         missed = min(math.log((o + MISSED) / (o + 1.0)) for o in odds_of_seen)
-        gain = (1.0 - sum(s.weight for s in of_one if s.is_found)) * math.log(CHANCE)
+        gain = (1.0 - sum(s.weight for s in of_one if s.is_found)) * math.log(CHANCE_NEAR)
         coincidence = max(gain - math.log(num_proposed), min(gain, 0.0))
-        of_photos = sum(s.weight * math.log1p(s.odds + CONTRADICTED * s.odds_elsewhere) for s in of_one)
+        of_photos = sum(s.weight * math.log1p(s.odds + CONTRADICTED_ODDS * s.odds_elsewhere) for s in of_one)
         logits.append(of_photos + missed + coincidence)
     alone = [sum(p for _, p in member.own_poses) for member in members]
     weights = [max(s.weight for s in of_photo) for of_photo in zip(*tested, strict=True)]
     sure = [-math.log(max(1.0 - p, LEAST_NONE)) for p in alone]
-    apart = math.log(CONTRADICTED) + sum(w * s for w, s in zip(weights, sure, strict=False))
+    apart = math.log(CONTRADICTED_ODDS) + sum(w * s for w, s in zip(weights, sure, strict=False))
     odds = np.exp(np.array([*logits, 0.0, apart]) - max([*logits, 0.0, apart]))
     odds = np.append(odds[:-2], odds[-2:].sum())
     return np.asarray(odds / odds.sum())

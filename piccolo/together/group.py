@@ -26,7 +26,7 @@ from ..localization.means import Means
 from ..panorama import Panorama
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
-from .bundle import EVEN, LOCAL_ERRORS, judge_placed, place_between
+from .bundle import EVEN_ODDS, LOCAL_ERRORS, judge_placed, place_between
 from .bundle_search import NUM_BUNDLES, Support, find_support, weigh_bundles
 from .links import FIRM, WEAK, Links, Places, are_bridged, compute_shared, find_links, find_pose, spread
 from .members import Member, find_members
@@ -92,7 +92,7 @@ def localize_linked(members: Mapping[int, Member], means: Means, min_confidence:
         while proposed := propose_places(group, left):
             tested, probabilities = weigh_places(group, proposed, left, means)
             found: dict[int, Result] = {}
-            if probabilities[0] >= EVEN:
+            if probabilities[0] >= EVEN_ODDS:
                 found = judge_group(group, tested, probabilities, means, min_confidence)
             for k, result in found.items():
                 grouped[k] = Grouped(result, tuple(other for other in found if other != k))
@@ -154,7 +154,9 @@ def count_votes(group: Group, places: Places) -> float:
 def settle(group: Group, places: Places, numbers: Collection[int]) -> Places:
     """Place the photos again, by those whose own poses are likely and where they are expected to be."""
     own = {k: find_own(group.members[k], placed.pose) for k, placed in places.items()}
-    anchors = {k: group.links.place(k, pose) for k, (pose, probability) in own.items() if probability > EVEN}
+    anchors = {
+        k: group.links.place(k, pose) for k, (pose, probability) in own.items() if probability > EVEN_ODDS
+    }
     return spread(group.links, anchors, numbers, FIRM) if anchors else places
 
 
@@ -209,7 +211,7 @@ def judge_group(
         placed = place_between(belongs, own.get(number), expected.get(number))
         is_refused = bool(member.alone.belief.ruled_out) and not member.is_misplaced
         is_own = support.is_found and placed.shares.right >= placed.shares.missed
-        if is_refused or placed.gaussian is None or belongs.here < EVEN:
+        if is_refused or placed.gaussian is None or belongs.here < EVEN_ODDS:
             continue
         if member.alone.status == LOCALIZED and not is_own:  # what is sure alone others do not move
             continue

@@ -21,7 +21,15 @@ from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, F1, HALF, Scalar, inline_kernel, kernel
 from ..panorama.local_normalization import LEVELS_PER_UNIT
-from .view import BLOCK, Scratch, ViewArrays, ViewConfig, average_nodes, normalize_cells, thread_scratch
+from .view import (
+    VIEWS_A_TASK,
+    Scratch,
+    ViewArrays,
+    ViewConfig,
+    average_nodes,
+    normalize_cells,
+    thread_scratch,
+)
 
 WIDE_RINGS = 12
 SEARCH_VIEW = ViewConfig(num_rings=SEARCH_RINGS, stats_rings=16, sigma_deg=22.0, voxel_per_range=1 / 15)
@@ -143,10 +151,10 @@ def render_views(octree: Octree, centers: Array, config: ViewConfig, workers: Wo
     views.centers[:] = centers
 
     def run(lo: int) -> None:
-        part: list[Any] = [values[lo : lo + BLOCK] for values in views]
+        part: list[Any] = [values[lo : lo + VIEWS_A_TASK] for values in views]
         render_block(octree, config.voxel_per_range, config.arrays, thread_scratch(), Views(*part))
 
-    list(workers.map(run, range(0, len(centers), BLOCK), "render views"))
+    list(workers.map(run, range(0, len(centers), VIEWS_A_TASK), "render views"))
     return views
 
 
@@ -165,10 +173,10 @@ def render_wide(octree: Octree, centers: Array, config: ViewConfig, workers: Wor
     view = config.arrays
 
     def run(lo: int) -> None:
-        part = slice(lo, lo + BLOCK)
+        part = slice(lo, lo + VIEWS_A_TASK)
         render_wide_block(octree, centers[part], voxel, view, thread_scratch(), features[part], seen[part])
 
-    list(workers.map(run, range(0, num, BLOCK), "render views"))
+    list(workers.map(run, range(0, num, VIEWS_A_TASK), "render views"))
     return WideViews(features.reshape(num, 3 * num_wide), seen)
 
 

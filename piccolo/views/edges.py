@@ -13,10 +13,10 @@ from ..arrays import Array32, Floats, Int32s
 from ..cloud.surfaces import rise
 from ..geometry.colors import colors_of_edges
 from ..geometry.sphere import cells_around, make_grid
-from ..panorama.edges import VERTICAL
+from ..panorama.edges import COS_UPRIGHT_EDGE
 
 FULL_BEND = 0.07  # of the inverse range from cell to cell; the strength is the root of the fraction
-NOTHING = -1e12  # so far below that no value interpolated with it is positive
+FAR_BELOW = -1e12  # so far below that no value interpolated with it is positive
 
 
 @lru_cache(maxsize=1)
@@ -42,7 +42,7 @@ def draw_edges(sums: Array32, num_rings: int) -> None:
 
     counts = np.maximum(sums[:, 6], 1.0)
     inverse = np.where(
-        sums[:, 6] > 0.0, counts / np.maximum(np.linalg.norm(sums[:, :3], axis=1), 1e-9), NOTHING
+        sums[:, 6] > 0.0, counts / np.maximum(np.linalg.norm(sums[:, :3], axis=1), 1e-9), FAR_BELOW
     )
     sides = look(inverse).reshape(2, 2, -1)
     bend = sides.sum(axis=1) - 2.0 * inverse
@@ -51,7 +51,7 @@ def draw_edges(sums: Array32, num_rings: int) -> None:
     part = np.where(is_whole, np.abs(bend) / np.where(is_whole, nearest, 1.0), 0.0) / FULL_BEND
     across, down = np.sqrt(np.minimum(part, 1.0))
     strength = np.maximum(across, down)
-    vertical = strength * rise(across / np.maximum(np.hypot(across, down), 1e-9), VERTICAL)
+    vertical = strength * rise(across / np.maximum(np.hypot(across, down), 1e-9), COS_UPRIGHT_EDGE)
     strength, vertical = ((2.0 * edge + look(edge).sum(axis=0)) / 6.0 for edge in (strength, vertical))
     gray = 2.0 * (sums[:, 3:6].mean(axis=1) / counts) - 0.5
     sums[:, 3:6] = sums[:, 6:7] * (colors_of_edges(strength, vertical, gray) / np.float32(255.0))

@@ -19,7 +19,7 @@ from .zbuffer import View
 
 OVERLAY_WIDTH = 1024
 NUM_TILES = 16  # columns of the checkerboard
-MAX_SPHERE_WIDTH = 8192  # [px]
+MAX_DRAWN_WIDTH = 8192  # [px]
 UPRIGHT = np.eye(3)
 
 
@@ -91,8 +91,8 @@ def overlay_png(points: PackedPoints, panorama: Panorama, pose: Pose, workers: W
 
 
 def sphere_width_for(camera: Camera) -> int:
-    """Return the even width [px] of a sphere as fine as the camera at its axis, up to MAX_SPHERE_WIDTH."""
-    return min(2 * math.ceil(math.pi * camera.resolution), MAX_SPHERE_WIDTH)
+    """Return the even width [px] of a sphere as fine as the camera at its axis, up to MAX_DRAWN_WIDTH."""
+    return min(2 * math.ceil(math.pi * camera.resolution), MAX_DRAWN_WIDTH)
 
 
 def cut(image: Bytes, camera: Camera, R_lens_from_cam: Array = UPRIGHT) -> Bytes:

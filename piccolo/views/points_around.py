@@ -33,7 +33,7 @@ from .zbuffer import VISIBLE_OFFSET
 LOW_32 = np.uint64(0xFFFFFFFF)
 FILLED = 0.97  # of the room for points; the rest is for chance
 PLACE_SPACING = 0.01  # [m] between places
-NUM_VIEWS = 32  # are kept: 12 MB
+NUM_KEPT_VIEWS = 32  # are kept: 12 MB
 NUM_POINT_SETS = 8  # 7 MB
 NUM_SURROUNDINGS = 2  # 11 MB
 
@@ -178,7 +178,7 @@ class RecentViews:
 
     def __init__(self, octree: Octree, averaged: Octree | None = None) -> None:
         """Prepare for views of an octree; averages are of another one, if it is given."""
-        self.averages: Callable[[Place, ViewConfig, Cone], Array32] = lru_cache(NUM_VIEWS)(
+        self.averages: Callable[[Place, ViewConfig, Cone], Array32] = lru_cache(NUM_KEPT_VIEWS)(
             partial(average_view, averaged or octree)
         )
         self.points: Callable[[Place, ViewConfig, bytes, Cone, int], Cells] = lru_cache(NUM_POINT_SETS)(

@@ -21,8 +21,8 @@ from ..kernels.jit import F0, F1, Scalar, inline_kernel, kernel
 from ..panorama.texels import channel
 from .zbuffer import Coordinates, View, indices_in_front, nearest_depth
 
-NUM_NEIGHBORS = 10
-CHUNK = 65_536
+NUM_SURFEL_NEIGHBORS = 10
+SURFEL_CHUNK = 65_536
 RADIUS_PER_REACH = 0.8  # surfel radius by the distance of the farthest of these neighbours
 # A ray that grazes an edge leaves points in the air behind it. Such a point is farther from its neighbours
 # than they are from theirs.
@@ -32,13 +32,13 @@ MAX_THICKNESS = 0.12  # smallest eigenvalue by the sum of all; of a ball, such a
 THICK_RADIUS = 0.25  # so much smaller are surfels that are no part of a surface
 MIN_RADIUS_PX = np.float32(0.75)  # every surfel reaches the centre of a pixel
 # Layers nearer to each other than this are one surface: noise of a scanner.
-BAND = np.float32(1.01)
+SURFACE_BAND = np.float32(1.01)
 BAND_OFFSET = np.float32(0.02)  # [m]
-LEAST_WEIGHT = np.float32(1e-4)  # at the rim: whatever is seen has a colour
+LEAST_RIM_WEIGHT = np.float32(1e-4)  # at the rim: whatever is seen has a colour
 MAX_SLOPE = np.float32(1.25)  # of the range within a surfel or a pixel
-STRIP = 1 << 21  # pixels that one thread draws at a time
+PIXELS_AT_ONCE = 1 << 21  # pixels that one thread draws at a time
 MAX_SURFELS = 8_000_000  # of more points that may be seen, this many are drawn, evenly in space
-MAX_ANGLE = 0.3  # [rad] as which a surfel's radius is seen, at most
+MAX_SURFEL_ANGLE = 0.3  # [rad] as which a surfel's radius is seen, at most
 MIN_COSINE = 0.15  # a surfel seen flatter than this is turned towards the camera: normals are not that sure
 # Rooms behind gaps leave lone points with large surfels. Large surfels far off are sparse surfaces.
 MAX_RADIUS = 1.5  # by the radius that 95 % of the surfels stay below
@@ -70,21 +70,21 @@ def make_surfels(points: PackedPoints, workers: Workers) -> Surfels:
     positions = points.stack()
     normals = np.zeros_like(positions)
     radii = np.zeros(len(positions), np.float32)
-    if len(positions) <= NUM_NEIGHBORS:
+    if len(positions) <= NUM_SURFEL_NEIGHBORS:
         return Surfels(points, normals, radii)
     tree = cKDTree(positions, balanced_tree=False, compact_nodes=False)
-    neighbors = np.empty((len(positions), NUM_NEIGHBORS + 1), np.int32)
+    neighbors = np.empty((len(positions), NUM_SURFEL_NEIGHBORS + 1), np.int32)
 
     def run(lo: int) -> None:
-        part = slice(lo, lo + CHUNK)
-        distances, neighbors[part] = tree.query(positions[part], NUM_NEIGHBORS + 1)
+        part = slice(lo, lo + SURFEL_CHUNK)
+        distances, neighbors[part] = tree.query(positions[part], NUM_SURFEL_NEIGHBORS + 1)
         normals[part], is_thick = planes(positions[neighbors[part]])
         radii[part] = RADIUS_PER_REACH * distances[:, -1] * np.where(is_thick, THICK_RADIUS, 1.0)
 
-    list(workers.map(run, range(0, len(positions), CHUNK), "surface"))
+    list(workers.map(run, range(0, len(positions), SURFEL_CHUNK), "surface"))
     is_surface = np.empty(len(positions), np.bool_)
-    for lo in range(0, len(positions), CHUNK):
-        part = slice(lo, lo + CHUNK)
+    for lo in range(0, len(positions), SURFEL_CHUNK):
+        part = slice(lo, lo + SURFEL_CHUNK)
         is_surface[part] = radii[part] <= MAX_REACH * np.median(radii[neighbors[part]], axis=1)
     return Surfels(points, normals, radii).take(np.flatnonzero(is_surface))
 
@@ -158,8 +158,8 @@ def splat(
                     continue
                 if len(sums) == 0:
                     depth[i, j] = min(depth[i, j], t)
-                elif t <= depth[i, j] * BAND + BAND_OFFSET:
-                    weight = (F1 - q) * (F1 - q) * (F1 - q) + LEAST_WEIGHT
+                elif t <= depth[i, j] * SURFACE_BAND + BAND_OFFSET:
+                    weight = (F1 - q) * (F1 - q) * (F1 - q) + LEAST_RIM_WEIGHT
                     s = sums[i, j]
                     s[0] += weight * channel(c, 0)
                     s[1] += weight * channel(c, 8)
@@ -206,7 +206,7 @@ def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -
     columns, rows = axes_of_pixels(width)
     rgb = np.zeros((width // 2, width, 3), np.uint8)
     depth = np.full((width // 2, width), np.inf, np.float32)
-    num_rows = max(1, STRIP // width)
+    num_rows = max(1, PIXELS_AT_ONCE // width)
 
     def run(first: int) -> None:
         part = slice(first, first + num_rows)
@@ -276,7 +276,7 @@ def place_discs(
         for k in range(3):
             disc[k] = R[k, 0] * dx + R[k, 1] * dy + R[k, 2] * dz
             disc[3 + k] = (R[k, 0] * nx + R[k, 1] * ny + R[k, 2] * nz) / length
-        radius = min(max(radii[n], 1e-9), MAX_ANGLE * distance)
+        radius = min(max(radii[n], 1e-9), MAX_SURFEL_ANGLE * distance)
         disc[6] = (nx * dx + ny * dy + nz * dz) / length
         disc[7] = 1.0 / (radius * radius)
         disc[8] = distance

@@ -18,8 +18,8 @@ from ..panorama.local_normalization import mean_and_inverse_std, opponent, zscor
 from .edges import draw_edges
 from .zbuffer import VISIBLE_FACTOR
 
-BLOCK = 64  # views that a thread makes at a time
-FAR = np.float32(1e30)
+VIEWS_A_TASK = 64  # views that a thread makes at a time
+FAR_RANGE = np.float32(1e30)
 
 Center = Sequence[float] | Array
 
@@ -164,7 +164,7 @@ def average_nodes(
     s = scratch
     cells = s.cells[:n]
     sums[:] = F0
-    sums[:, 7] = FAR
+    sums[:, 7] = FAR_RANGE
     for i in range(n):
         cell = cells[i]
         sums[cell, 7] = min(sums[cell, 7], s.ranges[i])

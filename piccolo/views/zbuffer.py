@@ -14,7 +14,7 @@ from ..kernels.jit import kernel, whole
 from ..panorama.texels import Pose32, channel, in_camera, pose_float32
 
 Coordinates = tuple[Array32, Array32, Array32]  # x, y, z (N,) [m]
-CHUNK = 4096
+DEPTH_CHUNK = 4096
 
 # A point is visible if it is not farther than the nearest in its cell by this much. The factor lets grazing
 # floors and walls through, whose ranges vary within a cell; the offset [m] covers range noise nearby. Of
@@ -22,7 +22,7 @@ CHUNK = 4096
 # for keypoints, whose pixels are small: these have their own, with which their bits are known.
 VISIBLE_FACTOR = np.float32(1.08)
 VISIBLE_OFFSET = np.float32(0.1)
-BAND = np.float32(1.0 + 0.15)  # a cell's colour is the mean of points up to this times its nearest range
+CELL_BAND = np.float32(1.0 + 0.15)  # a cell's colour is the mean of points up to this times its nearest range
 MIN_VIEW_WIDTH = 32  # [px] of a rendered view
 MAX_VIEW_WIDTH = 4096
 VISIBLE_WIDTH = 180  # cells of 2 degrees
@@ -53,7 +53,7 @@ def cells_and_ranges(
     last_column = np.int32(width - 1)
     last_row = np.int32(width // 2 - 1)
     x, y, z = points
-    end = min(len(x), begin + CHUNK)
+    end = min(len(x), begin + DEPTH_CHUNK)
     x = x[begin:end]
     y = y[begin:end]
     z = z[begin:end]
@@ -72,9 +72,9 @@ def nearest_ranges(
 ) -> None:
     """Write the range [m] of the nearest point of each cell into `depth` (H * W,), which holds inf before."""
     pose = pose_float32(R_cam_from_world, center_world)
-    cells = np.empty(CHUNK, np.int32)
-    ranges = np.empty(CHUNK, np.float32)
-    for lo in range(0, len(points[0]), CHUNK):
+    cells = np.empty(DEPTH_CHUNK, np.int32)
+    ranges = np.empty(DEPTH_CHUNK, np.float32)
+    for lo in range(0, len(points[0]), DEPTH_CHUNK):
         for i in range(cells_and_ranges(points, lo, pose, width, cells, ranges)):
             depth[cells[i]] = min(depth[cells[i]], ranges[i])
 
@@ -89,14 +89,14 @@ def mean_colors(
     depth: Array32,
     sums: Array,
 ) -> None:
-    """Add up (H * W, 4): R, G, B [8-bit levels] and count of the points within BAND of the nearest."""
+    """Add up (H * W, 4): R, G, B [8-bit levels] and count of the points within CELL_BAND of the nearest."""
     pose = pose_float32(R_cam_from_world, center_world)
-    cells = np.empty(CHUNK, np.int32)
-    ranges = np.empty(CHUNK, np.float32)
-    for lo in range(0, len(points[0]), CHUNK):
+    cells = np.empty(DEPTH_CHUNK, np.int32)
+    ranges = np.empty(DEPTH_CHUNK, np.float32)
+    for lo in range(0, len(points[0]), DEPTH_CHUNK):
         for i in range(cells_and_ranges(points, lo, pose, width, cells, ranges)):
             cell = cells[i]
-            if ranges[i] <= depth[cell] * BAND:
+            if ranges[i] <= depth[cell] * CELL_BAND:
                 c = rgbx[lo + i]
                 sums[cell, 0] += channel(c, 0)
                 sums[cell, 1] += channel(c, 8)
@@ -115,10 +115,10 @@ def select_visible(
 ) -> int:
     """Write the indices of the points that are visible, given `depth` (H * W,) [m]; return their number."""
     pose = pose_float32(R_cam_from_world, center_world)
-    cells = np.empty(CHUNK, np.int32)
-    ranges = np.empty(CHUNK, np.float32)
+    cells = np.empty(DEPTH_CHUNK, np.int32)
+    ranges = np.empty(DEPTH_CHUNK, np.float32)
     count = 0
-    for lo in range(0, len(points[0]), CHUNK):
+    for lo in range(0, len(points[0]), DEPTH_CHUNK):
         for i in range(cells_and_ranges(points, lo, pose, width, cells, ranges)):
             if ranges[i] <= depth[cells[i]] * VISIBLE_FACTOR + VISIBLE_OFFSET:
                 indices[count] = lo + i
@@ -140,7 +140,7 @@ def nearest_depth(points: PackedPoints, pose: Pose, width: int) -> Array32:
 def render_view(points: PackedPoints, pose: Pose, width: int) -> View:
     """Render the cloud at a pose, (width / 2, width) cells; colours in float32, 0 to 1.
 
-    A cell's colour is the mean of the points within BAND of its nearest range.
+    A cell's colour is the mean of the points within CELL_BAND of its nearest range.
     """
     depth = nearest_depth(points, pose, width)
     sums = np.zeros((depth.size, 4))

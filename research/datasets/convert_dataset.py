@@ -18,13 +18,13 @@ from piccolo.arrays import Array
 from piccolo.cli.command import Arguments, add_command, check_folder_name, command, option
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.point_validator import PointValidator
-from piccolo.cloud.readers.reader import CHUNK
+from piccolo.cloud.readers.reader import POINTS_A_CHUNK
 from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.soa import pack_points
 from piccolo.cloud.stream import open_cloud, open_source
 from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.errors import InputError, unreadable
-from piccolo.evidence.occlusion import VIEW_WIDTH, measure_agreement
+from piccolo.evidence.occlusion import AGREEMENT_WIDTH, measure_agreement
 from piccolo.files.atomic import check_output_folder, replacing_folder, write_atomically
 from piccolo.geometry.pose import Pose, move, transform_points
 from piccolo.jobs.threads import Progress, Workers
@@ -102,7 +102,7 @@ def check_scene(scene: Scene, num_queries: int, workers: Workers) -> Check:
 
     def check(query: Query) -> ConventionCheck:
         pose = Pose(query.pose.R_cam_from_world, query.pose.center_world - voxels.origin)
-        panorama = shrink(read_panorama(query.image), VIEW_WIDTH)  # once for all variants
+        panorama = shrink(read_panorama(query.image), AGREEMENT_WIDTH)  # once for all variants
         variants = convention_variants(pose, voxels.origin)
         scores = {
             words: measure_agreement(points, panorama, variant).score for words, variant in variants.items()
@@ -257,7 +257,7 @@ def _write_cloud(spec: SceneSpec, path: Path, show: Progress) -> tuple[int, list
             warnings += source.warnings
             validator.path = part.path
             validator.units = np.array(source.units)
-            total = None if source.num_points is None else math.ceil(source.num_points / CHUNK)
+            total = None if source.num_points is None else math.ceil(source.num_points / POINTS_A_CHUNK)
             try:
                 for raw in show(source.read_chunks(), total, f"{spec.name}: {part.path.name}"):
                     points, colors = validator.filter(raw)

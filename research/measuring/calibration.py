@@ -68,7 +68,7 @@ class Outcome(NamedTuple):
         within = 1.0
         if self.covariance is not None:
             within = probability_of_ball(self.covariance.matrix[3:, 3:], MAX_DISTANCE)
-        places = confidence.posterior(self.standings, self.std_of_fit, model)[:-1]
+        places = confidence.posterior(self.standings, self.std_of_fit, model=model)[:-1]
         return make_belief(places, within).probabilities
 
 

@@ -19,6 +19,7 @@ from piccolo.judge.result import Result
 from piccolo.localization.localize import localize
 from piccolo.localization.means import Means
 from piccolo.panorama import read_panorama
+from piccolo.problem.method import METHOD, Method
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
 
 from ..scene import Scene, document_of_pose, read_scene
@@ -217,9 +218,9 @@ def all_trials(arguments: Arguments, workers: Workers) -> Iterator[tuple[str, Po
             yield scene.name, points, trials
 
 
-def localize_trial(scan_map: ScanMap, trial: Trial, workers: Workers) -> Result:
+def localize_trial(scan_map: ScanMap, trial: Trial, workers: Workers, method: Method = METHOD) -> Result:
     """Localize the photo of a trial."""
-    settings = CoarseToFineSettings(gravity=trial.gravity)
+    settings = CoarseToFineSettings(gravity=trial.gravity, method=method)
     photo = Photo(trial.rgb, focal_px=trial.focal_px, camera=trial.calibration, mask=trial.is_masked)
     return localize(scan_map, read_panorama(photo), settings, Means(settings.effort, workers, Stopwatch()))
 

@@ -1,12 +1,9 @@
-"""Move the constants that decide by a fifth, one at a time, and measure what changes."""
+"""Move the numbers by which the method decides by a fifth, one at a time, and measure what changes."""
 
-import importlib
 import math
-import sys
 from argparse import ArgumentParser
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import chain, product
 from typing import NamedTuple
 
@@ -18,6 +15,7 @@ from piccolo.geometry.nearness import RIGHT
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.judge.probability import LOCALIZED
 from piccolo.judge.result import Result
+from piccolo.problem.method import METHOD, Method
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
 
 from ..evaluation.tables import table_of
@@ -30,41 +28,12 @@ example:
   python tools/benchmark.py sensitivity --scenes BENCH/house BENCH/hospital --seeds 900 902 --most 8
 
 Of each scene the first --most panoramas and as many phone photos cut out of them, and of each seed's made
-rooms the first --most trials, are localized with every constant as it is, then a fifth smaller and larger.
+rooms the first --most trials, are localized with every number of the method as it is, then a fifth smaller
+and larger.
 Prints a table: right, localized, wrong of these, the median error of those right in both, and how many
-results changed at all. A cosine is moved by its angle. docs/METHOD.md has the table.
+results changed at all. piccolo/problem/method.py has the numbers.
 """
 STEP = 0.2
-# by module of piccolo; those of compiled kernels and of the map can't be moved once that is made
-CONSTANTS: dict[str, tuple[str, ...]] = {
-    "judge.probability": ("LEAST_RATIO", "NOISE_MATCHES"),
-    "evidence.occlusion": ("CONTRADICTING", "SIGMA_DEG"),
-    "evidence.covariance": ("MOST_SCORE", "PIXEL_SHARE", "UNCALIBRATED_SHARE"),
-    "evidence.focal_length": ("EDGE_ERROR",),
-    "evidence.lens_matches": ("INFLATION", "MATCHED_DEVIATION"),
-    "evidence.verification": ("COS_AGREE",),
-    "judge.candidate": ("LEAST_SHARED",),
-    "judge.selection": (
-        "CHANCE_MATCHES",
-        "CLEAR_MARGIN",
-        "FAINT_SCORE",
-        "MIRROR_RATIO",
-        "RIVAL_SCORE",
-        "SURE_MATCHES",
-        "SURE_ODDS",
-    ),
-    "localization.attempts": ("ENOUGH_MATCHES", "FIRST_MIRROR_RATIO", "NUM_MATCHED"),
-    "localization.beam": ("FAINT_PART", "NUM_FOUND", "NUM_SCORED"),
-    "localization.calibration": ("CLEARLY",),
-    "localization.judging": ("WORTH_ASKING",),
-    "localization.ladder": ("MAX_PERTURBATIONS", "MIN_GAIN", "PERTURBED_ANGLE", "PERTURBED_DISTANCE"),
-    "localization.last_descent": ("NEAR_SCORE",),
-    "localization.mirror": ("ENOUGH_EXPLAINED",),
-    "localization.search": ("CANDIDATES_PER_START", "POSES_PER_START"),
-    "problem.settings": ("FIRST_STARTS",),
-    "local_features.matching": ("DISTINCT_RATIO",),
-    "local_features.hypotheses": ("MAX_VOTERS", "NUM_CLUSTERS"),
-}
 
 
 class Place(NamedTuple):
@@ -81,32 +50,13 @@ class Measured(NamedTuple):
     errors_m: list[float]  # nan where there is no truth or the pose is wrong
 
 
-def move(value: float, name: str, factor: float) -> float:
-    """Return a constant times a factor; a cosine's angle is moved, and a whole number by at least 1."""
-    if name.startswith("COS_"):
-        return math.cos(factor * math.acos(value))
+def move(method: Method, name: str, factor: float) -> Method:
+    """Return a method with one of its numbers times a factor; a whole number is moved by at least 1."""
+    value = getattr(method, name)
     if not isinstance(value, int):
-        return value * factor
+        return replace(method, **{name: value * factor})
     step = max(1, round(abs(factor - 1.0) * value))
-    return value + (step if factor > 1.0 else -step)
-
-
-@contextmanager
-def move_constant(module: str, name: str, factor: float) -> Iterator[None]:
-    """Move a constant in its module and in all that have imported it."""
-    value = getattr(importlib.import_module(f"piccolo.{module}"), name)
-    users = [
-        vars(user)
-        for key, user in list(sys.modules.items())
-        if key.startswith("piccolo.") and vars(user).get(name) is value
-    ]
-    for names in users:
-        names[name] = move(value, name, factor)
-    try:
-        yield
-    finally:
-        for names in users:
-            names[name] = value
+    return replace(method, **{name: value + (step if factor > 1.0 else -step)})
 
 
 def list_places(arguments: Arguments, workers: Workers) -> Iterator[Place]:
@@ -125,12 +75,12 @@ def list_places(arguments: Arguments, workers: Workers) -> Iterator[Place]:
         yield Place(prepare_map(stream, workers, has_features=True), trials[: 2 * arguments.most])
 
 
-def measure(places: Sequence[Place], workers: Workers) -> Measured:
+def measure(places: Sequence[Place], workers: Workers, method: Method = METHOD) -> Measured:
     """Localize all trials."""
     measured = Measured([], [])
     for scan_map, trials in places:
         for trial in trials:
-            found = localize_trial(scan_map, trial, workers)
+            found = localize_trial(scan_map, trial, workers, method)
             measured.found.append(found)
             truth = trial.true_pose
             if truth and found.best_pose and RIGHT.holds(found.best_pose, truth):
@@ -141,14 +91,14 @@ def measure(places: Sequence[Place], workers: Workers) -> Measured:
 
 
 def row_of(name: str, measured: Measured, before: Measured) -> dict[str, str]:
-    """Return a table's line: what a constant's move does, beside the results before."""
+    """Return a table's line: what a number's move does, beside the results before."""
     in_both = ~np.isnan(measured.errors_m) & ~np.isnan(before.errors_m)
     keys = [[(one.status, one.confidence, one.best_pose) for one in run.found] for run in (measured, before)]
     num_changed = sum(one != other for one, other in zip(*keys, strict=True))
     is_right = ~np.isnan(measured.errors_m)
     is_sure = np.array([one.status == LOCALIZED for one in measured.found])
     return {
-        "constant": name,
+        "number": name,
         "right": f"{is_right.sum()}",
         "localized": f"{is_sure.sum()}",
         "wrong of these": f"{(is_sure & ~is_right).sum()}",
@@ -166,15 +116,14 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Arguments) -> int:
-    """Measure with every constant as it is, then with each of them moved; print the table."""
+    """Measure with every number as it is, then with each of them moved; print the table."""
     workers = Workers(arguments.threads)
     places = list(list_places(arguments, workers))
     before = measure(places, workers)
     rows = [row_of("as they are", before, before)]
-    for module, names in CONSTANTS.items():
-        for name, factor in product(names, (1.0 - STEP, 1.0 + STEP)):
-            with move_constant(module, name, factor):
-                rows.append(row_of(f"{module}.{name} x {factor:.1f}", measure(places, workers), before))
-            arguments.note(" ".join(rows[-1].values()))
+    for field, factor in product(fields(Method), (1.0 - STEP, 1.0 + STEP)):
+        moved = measure(places, workers, move(METHOD, field.name, factor))
+        rows.append(row_of(f"{field.name} x {factor:.1f}", moved, before))
+        arguments.note(" ".join(rows[-1].values()))
     print(table_of(rows).markdown())
     return 0

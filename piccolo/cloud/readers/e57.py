@@ -19,7 +19,7 @@ from ..settings import BY_FILE, RANGES, Channel, CloudSettings
 from ..units import describe_foreign, units_of_wkt
 from . import e57_file, reader
 from .e57_file import E57File, open_file, parse_integer, read_number, refusing
-from .reader import CHUNK, MissingChannelError, PointSource
+from .reader import POINTS_A_CHUNK, MissingChannelError, PointSource
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -32,8 +32,8 @@ INVALID = {  # fields that are 0 in valid points
     (INTENSITY,): "isIntensityInvalid",
 }
 OPEN = {"Float": (1.0, 1.0)}  # ranges that follow from the values: the usual brightest one, twice
-WIDE = RANGES[-1], RANGES[-1]  # of whole numbers
-TOLERANCE = 0.01  # of 255, what a float colour may lie outside of its range
+WIDE_RANGES = RANGES[-1], RANGES[-1]  # of whole numbers
+COLOR_TOLERANCE = 0.01  # of 255, what a float colour may lie outside of its range
 CHANNELS: dict[Channel, tuple[str, ...]] = {"colors": COLORS, "intensity": (INTENSITY,), "shape": ()}
 WANTED: dict[Channel, str] = {
     "colors": "wanted scans with colorRed colorGreen colorBlue",
@@ -48,8 +48,7 @@ KINDS = {
 }
 SUFFIX = {"jpeg": ".jpg", "png": ".png"}
 ENCODINGS = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}
-MAX_SIDE = 1 << 20  # [px]
-MAX_CRS_LENGTH = 20_000  # characters of a coordinate system's description
+MAX_IMAGE_SIDE = 1 << 20  # [px]
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ def open_e57(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "c
     with open_file(path) as file:
         scans, left_out = _scans(file, CHANNELS[channel])
         notes = _set_ranges(file, scans, options)
-        crs = file.root.findtext("coordinateMetadata", "")[:MAX_CRS_LENGTH]
+        crs = file.root.findtext("coordinateMetadata", "")[: reader.MAX_CRS_LENGTH]
     if not scans:
         error = InputError if channel == "shape" else MissingChannelError
         raise error(f"{path}: {left_out[0] if left_out else 'no scans'}, {WANTED[channel]}")
@@ -157,11 +156,11 @@ def _color_range(path: Path, element: Element, field: Element) -> tuple[float, f
         return low, high
     declared = [field.get(end) for end in ("minimum", "maximum")]
     if None in declared:
-        return OPEN.get(field.get("type", ""), WIDE)
+        return OPEN.get(field.get("type", ""), WIDE_RANGES)
     first, last = (e57_file.read_scaled(path, field, text or "") for text in declared)
     if not first < last:
         raise _UnusableError(f"has colours without a range: {name} is declared {first:g} to {last:g}")
-    return (first, last) if last < RANGES[-1] else OPEN.get(field.get("type", ""), WIDE)
+    return (first, last) if last < RANGES[-1] else OPEN.get(field.get("type", ""), WIDE_RANGES)
 
 
 def _set_ranges(file: E57File, scans: list[E57Scan], settings: CloudSettings) -> tuple[str, ...]:
@@ -209,7 +208,7 @@ def _colors(path: Path, scan: E57Scan, columns: dict[str, Array]) -> Bytes:
     low, high = np.array(scan.color_ranges).T
     with np.errstate(over="ignore", invalid="ignore"):
         brightness = (values - low) * (255.0 / (high - low))
-    is_wrong = ~((brightness >= -TOLERANCE) & (brightness <= 255.0 + TOLERANCE))
+    is_wrong = ~((brightness >= -COLOR_TOLERANCE) & (brightness <= 255.0 + COLOR_TOLERANCE))
     if is_wrong.any():
         i, k = np.argwhere(is_wrong)[0]
         wanted = f"wanted {low[k]:g} to {high[k]:g} as the file declares"
@@ -221,7 +220,7 @@ def _colors(path: Path, scan: E57Scan, columns: dict[str, Array]) -> Bytes:
 def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
     """Yield the columns of a scan, a chunk at a time, in arrays that the next chunk overwrites."""
     names = (*scan.coordinates, *scan.channels, *scan.invalid)
-    columns = {name: np.empty(min(scan.num_points, CHUNK)) for name in names}
+    columns = {name: np.empty(min(scan.num_points, POINTS_A_CHUNK)) for name in names}
     buffers = file.libe57.VectorSourceDestBuffer()
     num_read = 0
     count = 1
@@ -325,6 +324,6 @@ def _text(element: Element, place: str) -> str:
 
 def _side(path: Path, representation: Element, name: str) -> int:
     value = read_number(path, representation, name) or 0.0
-    if not 0 < value <= MAX_SIDE:
-        raise InputError(f"{path}: an image's {name} is {value:g}, wanted 1 to {MAX_SIDE}")
+    if not 0 < value <= MAX_IMAGE_SIDE:
+        raise InputError(f"{path}: an image's {name} is {value:g}, wanted 1 to {MAX_IMAGE_SIDE}")
     return int(value)

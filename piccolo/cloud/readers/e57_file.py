@@ -29,9 +29,9 @@ NAMESPACE = "{http://www.astm.org/COMMIT/E57/2010-e57-v1.0}"
 MAX_XML_SIZE = 1 << 26  # [byte]
 # libE57 takes time with the square of a structure's parts; a vector holds scans and images
 MAX_ELEMENTS = 500_000
-MAX_PARTS = 500
+MAX_XML_PARTS = 500
 MAX_IN_VECTOR = 20_000
-MAX_DEPTH = 32
+MAX_XML_DEPTH = 32
 INTEGER = re.compile(r"[+-]?[0-9]{1,19}")
 CHECK_ALL = 100  # [%] of the pages have their checksum verified
 
@@ -108,11 +108,12 @@ class _Limited(TreeBuilder):
         """Open an element."""
         self.num_elements += 1
         self.room[-1] -= 1
-        if self.num_elements > MAX_ELEMENTS or len(self.room) > MAX_DEPTH:
-            raise ValueError(f"more than {MAX_ELEMENTS} elements or {MAX_DEPTH} levels")
+        if self.num_elements > MAX_ELEMENTS or len(self.room) > MAX_XML_DEPTH:
+            raise ValueError(f"more than {MAX_ELEMENTS} elements or {MAX_XML_DEPTH} levels")
         if self.room[-1] < 0:
-            raise ValueError(f"more than {MAX_PARTS} elements in a structure or {MAX_IN_VECTOR} in a vector")
-        self.room.append(MAX_IN_VECTOR if attrs.get("type") == "Vector" else MAX_PARTS)
+            most = f"{MAX_XML_PARTS} elements in a structure or {MAX_IN_VECTOR} in a vector"
+            raise ValueError(f"more than {most}")
+        self.room.append(MAX_IN_VECTOR if attrs.get("type") == "Vector" else MAX_XML_PARTS)
         if any(name.lower().endswith("schemalocation") for name in attrs):
             raise ValueError("a schema in another file")
         return super().start(tag.removeprefix(NAMESPACE), attrs)

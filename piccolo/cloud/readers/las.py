@@ -20,7 +20,7 @@ from ...errors import InputError, import_optional
 from ..settings import BY_FILE, Channel, CloudSettings
 from . import reader
 from .las_file import WANTED, LasHeader, find_units, read_header, record_content
-from .reader import CHUNK, MissingChannelError, PointSource, quote_line
+from .reader import POINTS_A_CHUNK, MissingChannelError, PointSource, quote_line
 
 OFFSET_SIZE = 8  # [byte] of the chunk table's offset, in front of the first chunk
 MAX_ENTRY_SIZE = 32  # [byte], more than an entry of the table can take
@@ -36,7 +36,7 @@ SELECTED = ("XY_RETURNS_CHANNEL", "Z", "INTENSITY", "FLAGS", "CLASSIFICATION", "
 # Of the flags' byte the bit of withheld points, and the bits of the class.
 OLD_BITS = 0x80, 0x1F  # in the formats 0-5
 BITS = 0x04, 0xFF  # in 6-10
-MAX_SAMPLES = 1 << 20
+MAX_LAS_SAMPLES = 1 << 20
 NUM_SAMPLE_RUNS = 64
 BROKEN = "the file is cut off or broken"
 
@@ -211,22 +211,24 @@ def _open(header: LasHeader, options: CloudSettings, channel: Channel) -> PointS
 
 def _plain_layout(header: LasHeader) -> LasLayout:
     """Return the layout of records that are not compressed, in chunks small enough to be sampled."""
-    most = max(1, min(CHUNK, MAX_SAMPLES // NUM_SAMPLE_RUNS, MAX_CHUNK_SIZE // header.record_size))
+    most = max(
+        1, min(POINTS_A_CHUNK, MAX_LAS_SAMPLES // NUM_SAMPLE_RUNS, MAX_CHUNK_SIZE // header.record_size)
+    )
     counts = [most] * (header.num_points // most) + [header.num_points % most]
     chunks = tuple((count, count * header.record_size) for count in counts if count)
     return LasLayout(header.points_offset, chunks)
 
 
 def _chunks(header: LasHeader, layout: LasLayout, is_sample: bool = False) -> Iterator[Records]:
-    """Yield all records, CHUNK or fewer at once; for a sample about MAX_SAMPLES, spread over the file."""
+    """Yield all records, a chunk at once; for a sample about MAX_LAS_SAMPLES, spread over the file."""
     counts, sizes = np.array(layout.chunks, dtype=np.int64).T
     offsets = layout.offset + np.cumsum(sizes) - sizes
-    if is_sample and header.num_points > MAX_SAMPLES:
-        num_runs = min(max(2, MAX_SAMPLES // int(counts.max())), len(counts))
+    if is_sample and header.num_points > MAX_LAS_SAMPLES:
+        num_runs = min(max(2, MAX_LAS_SAMPLES // int(counts.max())), len(counts))
         firsts = np.linspace(0, len(counts) - 1, num_runs).astype(np.int64)
         ends = firsts + 1
     else:  # chunks read at once
-        most = max(1, min(CHUNK, MAX_CHUNK_SIZE // header.record_size))
+        most = max(1, min(POINTS_A_CHUNK, MAX_CHUNK_SIZE // header.record_size))
         firsts = np.flatnonzero(np.diff((np.cumsum(counts) - counts) // most, prepend=-1))
         ends = np.append(firsts[1:], len(counts))
     with header.path.open("rb") as file:
@@ -240,8 +242,8 @@ def _chunks(header: LasHeader, layout: LasLayout, is_sample: bool = False) -> It
             if layout.laszip:
                 content = decompress(header, layout, data, layout.chunks[first:end])
             records = np.frombuffer(content, dtype=header.dtype)
-            for begin in range(0, len(records), CHUNK):
-                yield records[begin : begin + CHUNK]
+            for begin in range(0, len(records), POINTS_A_CHUNK):
+                yield records[begin : begin + POINTS_A_CHUNK]
 
 
 def _read(header: LasHeader, layout: LasLayout, field: str, is_sample: bool = False) -> Iterator[reader.Part]:

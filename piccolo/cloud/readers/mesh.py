@@ -24,13 +24,22 @@ from ...geometry.pose import transform_points
 from ..settings import BY_FILE, Channel, CloudSettings, UpAxis
 from .mesh_files import GLB_MAGIC, Texture
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
-from .reader import CHUNK, GRAY, USUAL, MissingChannelError, PointSource, RawCloud, find_brightest, in_chunks
+from .reader import (
+    GRAY,
+    POINTS_A_CHUNK,
+    USUAL,
+    MissingChannelError,
+    PointSource,
+    RawCloud,
+    find_brightest,
+    in_chunks,
+)
 
 # 1 / p and 1 / p^2 of the plastic number p, the root of p^3 = p + 1
 R2_STEPS = (0.7548776662466927, 0.5698402909980532)
-BLOCK = 1 << 18  # triangles whose corners are held at once
+TRIANGLES_AT_ONCE = 1 << 18  # triangles whose corners are held at once
 DENSITY = 10_000.0  # points on a square metre, 1 cm apart
-MAX_POINTS = 30_000_000
+MAX_MESH_POINTS = 30_000_000
 MAX_TRIANGLES = 200_000_000  # those of a mesh count again at each place where the scene puts it
 
 
@@ -50,17 +59,19 @@ class Surface(NamedTuple):
         """Return the areas (T,) of the triangles in the world; 0 for those that aren't finite."""
         areas = np.empty(len(self.triangles))
         with np.errstate(all="ignore"):
-            for begin in range(0, len(areas), BLOCK):
-                corners = self.vertices[self.triangles[begin : begin + BLOCK]]
+            for begin in range(0, len(areas), TRIANGLES_AT_ONCE):
+                corners = self.vertices[self.triangles[begin : begin + TRIANGLES_AT_ONCE]]
                 edges = (corners[:, 1:] - corners[:, :1]) @ self.T_world_from_surface[:3, :3].T
                 normals = np.cross(edges[:, 0], edges[:, 1])
-                areas[begin : begin + BLOCK] = 0.5 * np.sqrt(np.einsum("ij,ij->i", normals, normals))
+                areas[begin : begin + TRIANGLES_AT_ONCE] = 0.5 * np.sqrt(
+                    np.einsum("ij,ij->i", normals, normals)
+                )
         areas[~np.isfinite(areas)] = 0.0
         return areas
 
 
 def sample_points(surfaces: Sequence[Surface], ends: Array, num_points: int) -> Iterator[RawCloud]:
-    """Yield the points of each surface, at most CHUNK at once; `ends` (P,) are cumulative areas."""
+    """Yield the points of each surface, at most POINTS_A_CHUNK at once; `ends` (P,) are cumulative areas."""
     area_per_point = float(ends[-1]) / num_points
     # the first point at or behind each surface's end
     behind = np.ceil(ends / area_per_point - 0.5).astype(np.int64)
@@ -80,8 +91,8 @@ def sample_points(surfaces: Sequence[Surface], ends: Array, num_points: int) -> 
         # rounding may put an area behind all ends; never a triangle of area 0
         last_row = int(np.searchsorted(area_up_to, area_up_to[-1]))
         area_before = float(ends[i - 1]) if i else 0.0
-        for begin in range(first, end, CHUNK):
-            k = np.arange(begin, min(begin + CHUNK, end))
+        for begin in range(first, end, POINTS_A_CHUNK):
+            k = np.arange(begin, min(begin + POINTS_A_CHUNK, end))
             areas = (k + 0.5) * area_per_point - area_before
             rows = np.minimum(np.searchsorted(area_up_to, areas, side="right"), last_row)
             yield _points(surface, k, rows, texels)
@@ -183,10 +194,10 @@ def _sample(loaded: Loaded, is_bare: bool) -> PointSource:
     if num_flat:
         notes.append(f"{path}: {num_flat} triangles without an area or with NaN coordinates left out")
     area = total * scale * scale  # [m^2]
-    num_points = round(min(area * DENSITY, MAX_POINTS))
+    num_points = round(min(area * DENSITY, MAX_MESH_POINTS))
     if num_points == 0:
         raise InputError(f"{path}: an area of {area:.2g} square metres, too small for points; set `units`")
-    if area * DENSITY > MAX_POINTS:
+    if area * DENSITY > MAX_MESH_POINTS:
         density = f"{num_points / area:.3g} points on each instead of {DENSITY:.0f}"
         notes.append(f"{path}: {area:.3g} square metres of surface, sampled with {density}")
     read_chunks = partial(sample_points, surfaces, ends, num_points)

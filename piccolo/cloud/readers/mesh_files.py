@@ -33,7 +33,7 @@ KNOWN_EXTENSIONS = frozenset(
     {"KHR_materials_unlit", "EXT_texture_webp", "KHR_mesh_quantization"}
 )  # of those a file may require
 UNREAD_EXTENSIONS = frozenset({"KHR_materials_pbrSpecularGlossiness", "KHR_texture_transform"})
-MAX_DEPTH = 200  # nodes below each other: a chain of n costs n^2
+MAX_NODE_DEPTH = 200  # nodes below each other: a chain of n costs n^2
 MAX_ROWS = 20_000_000  # vertices and indices of all primitives; more only in a file of more bytes
 MAX_SHARING = 4  # times that a byte may be part of an accessor, on average
 
@@ -42,7 +42,7 @@ NUM_OF_SHAPE = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3":
 FLOAT = 5126
 POINTS = 0
 TRIANGLES = 4
-STRIP = 5
+TRIANGLE_STRIP = 5
 FAN = 6
 COUNTS = {  # numbers that trimesh would count from the end if they were negative
     "bufferViews": ("buffer", "byteOffset", "byteLength", "byteStride"),
@@ -274,14 +274,14 @@ def _check_nodes(path: Path, tree: Json) -> None:
     nodes = tree.get("nodes", [])
     seen = set[int]()
     level = scenes[_count(tree.get("scene", 0))].get("nodes", []) if scenes else []
-    for _ in range(MAX_DEPTH):
+    for _ in range(MAX_NODE_DEPTH):
         num_seen = len(seen)
         seen.update(level)
         if len(seen) < num_seen + len(level):
             raise InputError(f"{path}: a node is named twice in its scene, {WANTED}")
         level = [child for i in level for child in nodes[_count(i)].get("children", [])]
     if level:
-        raise InputError(f"{path}: over {MAX_DEPTH} nodes below each other, {WANTED}")
+        raise InputError(f"{path}: over {MAX_NODE_DEPTH} nodes below each other, {WANTED}")
 
 
 def _material(path: Path, material: Json) -> Material:
@@ -316,7 +316,7 @@ def _keep_triangles(path: Path, tree: Json, materials: list[Material], num_bytes
     num_rows = 0
     meshes = tree.get("meshes", [])
     modes = {p.get("mode", TRIANGLES) for mesh in meshes for p in mesh["primitives"]}
-    wanted = modes & {TRIANGLES, STRIP, FAN} or {POINTS}
+    wanted = modes & {TRIANGLES, TRIANGLE_STRIP, FAN} or {POINTS}
     for mesh in meshes:
         shown = [p for p in mesh["primitives"] if p.get("mode", TRIANGLES) in wanted]
         kept = [_primitive(path, accessors, materials, primitive) for primitive in shown]

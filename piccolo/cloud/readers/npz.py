@@ -25,8 +25,8 @@ from .text_columns import MAX_COLUMNS, drop_broken, name_columns, names_of_user,
 NPY_MAGIC = b"\x93NUMPY"
 ZIP_MAGIC = b"PK\x03\x04"
 ZIP_NAME_AT = 30  # [byte] in an archive: the name of its first member
-NUM_SAMPLES = 10_000  # rows by whose values columns are named
-MAX_RATIO = 200  # unpacked to packed; real scans stay below 10, deflate could reach 1032
+NUM_SAMPLED_ROWS = 10_000  # rows by whose values columns are named
+MAX_ZIP_RATIO = 200  # unpacked to packed; real scans stay below 10, deflate could reach 1032
 MAX_UNPACKED = 1 << 34  # [byte] of an archive's arrays, which are read whole
 POINTS_NAMES = ("points", "xyz")
 COLORS_NAMES = ("colors", "rgb")
@@ -71,7 +71,7 @@ def open_npy(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "c
     note = ""
     if not names:
         rows = next(array.read_rows(), np.empty((0, num_columns)))
-        names = name_columns(drop_broken(rows[:: 1 + len(rows) // NUM_SAMPLES].astype(np.float64)))
+        names = name_columns(drop_broken(rows[:: 1 + len(rows) // NUM_SAMPLED_ROWS].astype(np.float64)))
         note = note_names(path, names, "")
     chosen = reader.find_fields([name for name in names if names.count(name) == 1], channel)
     if not chosen:
@@ -152,7 +152,7 @@ def _members(path: Path, is_bare: bool) -> list[zipfile.ZipInfo]:
             name = quote_line(info.filename.encode())
             raise InputError(f"{path}: {name} is encrypted or compressed in another way than by NumPy")
     size = sum(info.file_size for info in infos)
-    most = min(MAX_RATIO * path.stat().st_size, MAX_UNPACKED)
+    most = min(MAX_ZIP_RATIO * path.stat().st_size, MAX_UNPACKED)
     if size > most:
         raise InputError(f"{path}: the arrays promise {size} bytes, {most} at most are read; use .npy files")
     return infos

@@ -18,11 +18,11 @@ from . import reader
 from .reader import MissingChannelError, PointSource, quote_line
 from .text import LineLayout, NumberLines
 
-MAX_HEADER_SIZE = MAX_ROW_SIZE = 1 << 16  # [byte]; a row is a point
-MAX_COUNT_DIGITS = 10
+MAX_PCD_HEADER_SIZE = MAX_PCD_ROW = 1 << 16  # [byte]; a row is a point
+MAX_PCD_COUNT_DIGITS = 10
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 WANTED = "wanted a PCD file with the fields x y z and rgb, rgba or r g b"
-MAX_RATIO = 88  # of LZF, in which three bytes can stand for a copy of 264
+MAX_LZF_RATIO = 88  # of LZF, in which three bytes can stand for a copy of 264
 FIRST_LINES = re.compile(rb"(?:#[^\n]*\n|[ \t\r\n])*(?:# \.PCD|VERSION[ \t]+0?\.\d)")
 PADDING = "_"
 BROKEN = "the file is cut off or broken"
@@ -62,7 +62,7 @@ class PcdHeader(NamedTuple):
 def read_header(path: Path) -> PcdHeader:
     """Return the header of a PCD file; SIZE, TYPE and COUNT, if missing as in old files, are 4, F and 1."""
     with path.open("rb") as file:
-        head = file.read(MAX_HEADER_SIZE)
+        head = file.read(MAX_PCD_HEADER_SIZE)
     entries: dict[str, list[str]] = {}
     size = 0
     for line in head.split(b"\n"):
@@ -99,8 +99,8 @@ def _fields(path: Path, entries: dict[str, list[str]]) -> tuple[PcdField, ...]:
         fields.append(PcdField(name, type_.lower() + size, count, offset, column))
         offset += fields[-1].size
         column += count
-    if offset > MAX_ROW_SIZE:
-        raise InputError(f"{path}: the header promises {offset} bytes a point, wanted {MAX_ROW_SIZE} at most")
+    if offset > MAX_PCD_ROW:
+        raise InputError(f"{path}: the header promises {offset} bytes a point, wanted {MAX_PCD_ROW} at most")
     return tuple(fields)
 
 
@@ -119,7 +119,7 @@ def _num_points(path: Path, entries: dict[str, list[str]]) -> int:
 
 
 def _count(text: str) -> int | None:
-    return int(text) if text.isdecimal() and len(text) <= MAX_COUNT_DIGITS else None
+    return int(text) if text.isdecimal() and len(text) <= MAX_PCD_COUNT_DIGITS else None
 
 
 def open_pcd(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
@@ -184,7 +184,7 @@ def _read_compressed(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterato
     with header.path.open("rb") as file:
         file.seek(header.size)
         packed_size, size = reader.take_records(file, header.path, 2, np.dtype("<u4")).tolist()
-        if packed_size > found or size > MAX_RATIO * packed_size or size != promised:
+        if packed_size > found or size > MAX_LZF_RATIO * packed_size or size != promised:
             counts = f"found {found}, wanted {promised} for {header.num_points} points"
             raise InputError(f"{header.path}: {size} bytes packed into {packed_size}, {counts}; {BROKEN}")
         packed = reader.take_records(file, header.path, packed_size, np.dtype(np.uint8))

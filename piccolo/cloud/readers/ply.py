@@ -24,13 +24,13 @@ from .reader import MissingChannelError, PointSource, quote_line
 from .text import LineLayout, NumberLines
 
 MAGIC = (b"ply\n", b"ply\r")
-MAX_HEADER_SIZE = 1 << 20  # [byte]
+MAX_PLY_HEADER_SIZE = 1 << 20  # [byte]
 LINE_ENDS = (b"\r\n", b"\n", b"\r")
 ELEMENT_LINE = re.compile(rb"^(\s*element[ \t]+\S+[ \t]+)(\S+)[ \t]*$", re.MULTILINE)
 WANTED = "wanted a PLY file whose vertices have x y z and red green blue"
 LABELS_WANTED = "wanted x y z and a label (label, class or classification, or these after scalar_)"
-MAX_COUNT_DIGITS = 15
-MAX_ROW_SIZE = 1 << 24  # [byte] of a vertex with its lists
+MAX_PLY_COUNT_DIGITS = 15
+MAX_VERTEX_SIZE = 1 << 24  # [byte] of a vertex with its lists
 OPACITY = "opacity"
 MOST_STRAY = 20  # vertices to a face in a cloud that is no mesh
 
@@ -81,7 +81,7 @@ def open_ply(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "c
 
 
 def read_columns(header: PlyHeader, names: Sequence[str]) -> Iterator[reader.Columns]:
-    """Yield the named columns of up to raw.CHUNK vertices; those of an ASCII file are float64."""
+    """Yield the named columns of up to POINTS_A_CHUNK vertices; those of an ASCII file are float64."""
     if not header.is_ascii:
         if _lists_before(header):
             yield from _read_among_lists(header, names)
@@ -101,7 +101,7 @@ def read_columns(header: PlyHeader, names: Sequence[str]) -> Iterator[reader.Col
 def read_header(path: Path) -> PlyHeader:
     """Return the header of a PLY file; InputError if it is broken."""
     with path.open("rb") as file:
-        head = file.read(MAX_HEADER_SIZE)
+        head = file.read(MAX_PLY_HEADER_SIZE)
     if not head.startswith(MAGIC):
         raise InputError(f"{path}: begins with {head[:4]!r}, wanted 'ply' and a line end")
     line_end = next(end for end in LINE_ENDS if head.startswith(b"ply" + end))
@@ -112,7 +112,7 @@ def read_header(path: Path) -> PlyHeader:
     text = head[:size].replace(line_end, b"\n")
     text = bytes(byte if byte < 128 else ord("?") for byte in text)  # comments in any language
     counts = [match.group(2) for match in ELEMENT_LINE.finditer(text)]
-    if not all(count.isdigit() and len(count) <= MAX_COUNT_DIGITS for count in counts):
+    if not all(count.isdigit() and len(count) <= MAX_PLY_COUNT_DIGITS for count in counts):
         raise InputError(f"{path}: the header counts {quote_line(b' '.join(counts))} elements, {WANTED}")
     try:
         # counts of 0 let plyfile stop at the header's end
@@ -175,10 +175,10 @@ def _read_among_lists(header: PlyHeader, names: Sequence[str]) -> Iterator[reade
             count = num_rows
             types = {p.name: np.dtype(header.byte_order + p.val_dtype) for p in element.properties}
             while count > 0:
-                block = file.read(MAX_ROW_SIZE)
+                block = file.read(MAX_VERTEX_SIZE)
                 rest += block
-                starts, end = _walk(rest, min(count, reader.CHUNK), element, header.byte_order)
-                if not starts and (not block or len(rest) > MAX_ROW_SIZE):
+                starts, end = _walk(rest, min(count, reader.POINTS_A_CHUNK), element, header.byte_order)
+                if not starts and (not block or len(rest) > MAX_VERTEX_SIZE):
                     raise InputError(f"{header.path}: {count} rows of '{element.name}' are missing or broken")
                 if element is header.vertices and starts:
                     data = np.frombuffer(rest, np.uint8)

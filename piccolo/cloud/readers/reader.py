@@ -23,8 +23,9 @@ from ...geometry.colors import Labels, label_colors
 from ..settings import BY_FILE, RANGES, Channel, CloudSettings, UpAxis
 
 HEAD_SIZE = 512  # [byte] from which a format is known
-CHUNK = 1 << 17  # points of a chunk, at most: they stay in the processor's cache
-MAX_BLOCK_SIZE = 1 << 28  # [byte] read at once, in which CHUNK records of 256 bytes have room
+POINTS_A_CHUNK = 1 << 17  # points of a chunk, at most: they stay in the processor's cache
+MAX_BLOCK_SIZE = 1 << 28  # [byte] read at once, in which POINTS_A_CHUNK records of 256 bytes have room
+MAX_CRS_LENGTH = 20_000  # characters of a coordinate system's description
 CUT = "the file was cut while it was read, wanted a whole file"
 
 # Points (N, 3) in the file's unit, float32 if stored as such; and colours (N, 3), or a number (N,) of each.
@@ -50,15 +51,15 @@ COLOR_NAMES = (
 POINT_NAMES = (("x", "y", "z"), *(("easting", "northing", up) for up in ("elevation", "height", "z")))
 Columns = Sequence[NDArray[Any]]
 INTENSITY_NAMES = ("intensity", "scalar_intensity", "reflectance", "scalar_reflectance")
-BLACK, WHITE = 0.01, 0.99  # fraction of the points that are darker
+DARK_SHARE, BRIGHT_SHARE = 0.01, 0.99  # fraction of the points that are darker
 LARGEST = float(np.finfo(np.float32).max)
-NUM_BINS = 1 << 16
+NUM_LEVEL_BINS = 1 << 16
 NUM_COLORED = 6  # columns x y z red green blue
 SPLAT_FACTOR = 0.28209479177387814  # of the constant spherical harmonic, 1 / (2 sqrt(pi))
 GRAY = 128  # of points of which only the shape counts
 # as in PLY files, in lower case; the first that is found counts. CloudCompare prefixes `scalar_`
 LABEL_NAMES = ("label", "scalar_label", "class", "scalar_class", "classification", "scalar_classification")
-MOST = 2.0**32  # labels are below it, and above its negative
+MOST_LABEL = 2.0**32  # labels are below it, and above its negative
 
 
 class MissingChannelError(InputError):
@@ -172,8 +173,8 @@ def color_chunks(parts: Iterable[Part], brightest: float, locate: Callable[[int]
 
 
 def read_records(path: Path, offset: int, count: int, dtype: np.dtype[Any]) -> Iterator[NDArray[Any]]:
-    """Yield `count` records from byte `offset` on, CHUNK or fewer at once."""
-    most = max(1, min(CHUNK, MAX_BLOCK_SIZE // dtype.itemsize))
+    """Yield `count` records from byte `offset` on, POINTS_A_CHUNK or fewer at once."""
+    most = max(1, min(POINTS_A_CHUNK, MAX_BLOCK_SIZE // dtype.itemsize))
     with path.open("rb") as file:
         file.seek(offset)
         for begin in range(0, count, most):
@@ -189,9 +190,9 @@ def take_records(file: BufferedReader, path: Path, count: int, dtype: np.dtype[A
 
 
 def in_chunks(columns: Columns) -> Iterator[Columns]:
-    """Yield arrays of the same length, CHUNK or fewer rows at once."""
-    for begin in range(0, len(columns[0]), CHUNK):
-        yield [column[begin : begin + CHUNK] for column in columns]
+    """Yield arrays of the same length, POINTS_A_CHUNK or fewer rows at once."""
+    for begin in range(0, len(columns[0]), POINTS_A_CHUNK):
+        yield [column[begin : begin + POINTS_A_CHUNK] for column in columns]
 
 
 def points_of(columns: Columns) -> NDArray[np.floating[Any]]:
@@ -336,18 +337,22 @@ def as_gray(intensity: Array, low: float, high: float) -> Bytes:
 
 def _limits(chunks: Iterator[Part]) -> tuple[float, float]:
     """Return percentiles of the intensity of points with a position, within 1 %, or exact up to 255."""
-    histogram = np.zeros(NUM_BINS, np.int64)  # by the upper half of a float32's bits
+    histogram = np.zeros(NUM_LEVEL_BINS, np.int64)  # by the upper half of a float32's bits
     for points, intensity in chunks:
         is_measured = np.isfinite(points).all(axis=1) & np.isfinite(intensity)
         # + 0.0 turns -0.0 into 0.0
         values = (np.clip(intensity[is_measured], -LARGEST, LARGEST) + 0.0).astype(np.float32)
-        histogram += np.bincount(values.view(np.uint32) >> 16, minlength=NUM_BINS)
-    levels = (np.arange(NUM_BINS, dtype=np.uint32) << 16).view(np.float32)  # in each bin the nearest to 0
+        histogram += np.bincount(values.view(np.uint32) >> 16, minlength=NUM_LEVEL_BINS)
+    levels = (np.arange(NUM_LEVEL_BINS, dtype=np.uint32) << 16).view(
+        np.float32
+    )  # in each bin the nearest to 0
     order = np.argsort(levels)
     total = np.cumsum(histogram[order])
     if total[-1] == 0:  # no point has a position: others refuse that
         return 0.0, 1.0
-    low, high = levels[order[np.searchsorted(total, np.array([BLACK, WHITE]) * total[-1])]].tolist()
+    low, high = levels[
+        order[np.searchsorted(total, np.array([DARK_SHARE, BRIGHT_SHARE]) * total[-1])]
+    ].tolist()
     return low, high
 
 
@@ -355,7 +360,7 @@ def _read_labels(path: Path, read: PartReader, labels: Labels) -> Iterator[RawCl
     """Yield the points whose label counts, in the label's colour."""
     for points, found in read():
         values = np.where(np.isfinite(points).all(axis=1), found, 0.0)  # the others are left out later
-        is_whole = (np.abs(values) < MOST) & (values == np.floor(values))
+        is_whole = (np.abs(values) < MOST_LABEL) & (values == np.floor(values))
         if not is_whole.all():
             raise InputError(f"{path}: found the label {values[np.argmin(is_whole)]:g}, wanted whole numbers")
         numbers = values.astype(np.int64)

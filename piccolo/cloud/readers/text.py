@@ -24,7 +24,7 @@ from . import reader, text_columns
 from .reader import MissingChannelError, PointSource, find_brightest, quote_line
 from .text_columns import COMMENT_MARKS, Spelling, is_number, split, text_blocks
 
-BLOCK = 1 << 20  # [byte] read at once; no line is longer
+BYTES_AT_ONCE = 1 << 20  # [byte] read at once; no line is longer
 NUM_WITH_INTENSITY = 4  # columns of a line without colours: x y z intensity
 NUM_POSITION = 3
 WANTED = "wanted lines of numbers x y z r g b (`columns` names others)"
@@ -35,7 +35,7 @@ PTX_COLUMNS: dict[Channel, tuple[int, ...]] = {
     "shape": (0, 1, 2, 3),
 }
 NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
-MAX_COUNT_DIGITS = 9
+MAX_TEXT_COUNT_DIGITS = 9
 AFFINE = (0.0, 0.0, 0.0, 1.0)  # the matrix' last column
 ROUNDED = 1e-6  # by which it may differ
 PTX_WANTED = "wanted a PTX file with lines x y z intensity r g b"
@@ -55,14 +55,15 @@ class LineLayout(NamedTuple):
 def line_blocks(path: Path, start: int) -> Iterator[list[bytes]]:
     """Yield the lines from byte `start` on, some at a time, without their ends (LF, CR LF or CR)."""
     rest = b""
-    for block in text_blocks(path, BLOCK, start):
+    for block in text_blocks(path, BYTES_AT_ONCE, start):
         data = rest + block
         # A return at the end may be half of a line end: it waits for the next block.
         is_split = data.endswith(b"\r")
         end = 1 + max(data.rfind(b"\n"), data.rfind(b"\r", 0, len(data) - is_split))
         rest = data[end:]
-        if len(rest) > 2 * BLOCK:
-            raise InputError(f"{path}: a line of more than {BLOCK} bytes, wanted lines of a few numbers")
+        if len(rest) > 2 * BYTES_AT_ONCE:
+            found = f"a line of more than {BYTES_AT_ONCE} bytes"
+            raise InputError(f"{path}: {found}, wanted lines of a few numbers")
         yield data[:end].splitlines()
     if rest:
         yield rest.splitlines()
@@ -100,9 +101,9 @@ class NumberLines:
         return num_skipped
 
     def read_rows(self, count: int | None = None) -> Iterator[Array]:
-        """Yield the wanted columns (R, C) of `count` lines, or of all that are left, CHUNK at once."""
+        """Yield the wanted columns (R, C) of `count` lines, or of all that are left, a chunk at once."""
         num_columns = self.layout.num_columns or len(self.layout.columns)
-        most = max(1, min(reader.CHUNK, reader.MAX_BLOCK_SIZE // (8 * num_columns)))
+        most = max(1, min(reader.POINTS_A_CHUNK, reader.MAX_BLOCK_SIZE // (8 * num_columns)))
         num_rows = 0
         while num_rows != count and self.peek() is not None:
             rows = self._parse(most if count is None else min(most, count - num_rows))
@@ -147,7 +148,7 @@ class NumberLines:
 
     def _number_lines(self) -> Iterator[tuple[int, bytes]]:
         """Read the file again: yield the number in the file and the text of each line of numbers."""
-        head = next(text_blocks(self.path, text_columns.HEAD_SIZE), b"")
+        head = next(text_blocks(self.path, text_columns.TEXT_HEAD_SIZE), b"")
         number = len((head[: self.layout.start] + b".").splitlines()) - 1
         for lines in line_blocks(self.path, self.layout.start):
             for line in lines:
@@ -316,7 +317,7 @@ def _take_header(lines: NumberLines) -> PtxScan | None:
 def _numbers(line: bytes, num_wanted: int) -> list[float] | None:
     """Return the finite numbers of a header's line; None if it has others. A single one is a count."""
     fields = line.split()
-    if num_wanted == 1 and not (line.isdigit() and len(line) <= MAX_COUNT_DIGITS):
+    if num_wanted == 1 and not (line.isdigit() and len(line) <= MAX_TEXT_COUNT_DIGITS):
         return None
     try:
         values = [float(field) for field in fields]

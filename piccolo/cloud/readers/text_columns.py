@@ -16,8 +16,8 @@ from .reader import COLOR_NAMES, CUT, NUM_COLORED, POINT_NAMES
 
 COMMENT_MARKS = (b"#", b"//")
 MARKS = b"\"'[](){}"
-HEAD_SIZE = 1 << 16  # [byte] in which the header is looked for
-NUM_SAMPLES = 16  # places in the file whose lines are looked at
+TEXT_HEAD_SIZE = 1 << 16  # [byte] in which the header is looked for
+NUM_SAMPLED_PLACES = 16  # places in the file whose lines are looked at
 SAMPLE_SIZE = 1 << 13  # [byte]
 MAX_COLUMNS = 64
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
@@ -31,10 +31,10 @@ SKIP = "-"
 POSITION = ("x", "y", "z")
 RGB = ("red", "green", "blue")
 NORMAL = ("nx", "ny", "nz")
-UNIT_LENGTH = 0.01  # by which the length of a normal may differ from 1
-FEW = 0.1  # of the rows have no number in a column of numbers
+NORMAL_LENGTH_ERROR = 0.01  # by which the length of a normal may differ from 1
+FEW_ROWS = 0.1  # of the rows have no number in a column of numbers
 MOST_ROWS = 0.95  # of them are normals
-FAR = 4.0  # times as far from each other are an intensity and two colours as three colours
+FAR_FACTOR = 4.0  # times as far from each other are an intensity and two colours as three colours
 MAX_BYTE = 255.0
 MAX_VALUE = 65535.0
 BEFORE = 2  # columns that may be in front: an index, or FARO's row and column
@@ -94,7 +94,7 @@ def split(line: bytes, delimiter: str | None) -> list[str]:
 
 def read_fields(path: Path, wanted: str) -> Fields:
     """Return the fields of a file of lines, from its first lines."""
-    head = next(text_blocks(path, HEAD_SIZE), b"")
+    head = next(text_blocks(path, TEXT_HEAD_SIZE), b"")
     if b"\0" in head:
         raise InputError(f"{path}: holds bytes that are no text, {wanted}")
     start = len(BYTE_ORDER_MARK) if head.startswith(BYTE_ORDER_MARK) else 0
@@ -143,12 +143,14 @@ def read_samples(path: Path, fields: Fields, num_columns: int) -> Array:
     with path.open("rb") as file:
         size = file.seek(0, 2)
         is_plain = file.seek(0) == 0 and file.peek(2)[:2] not in UTF_16
-        for begin in np.linspace(fields.start, size, NUM_SAMPLES, endpoint=False).astype(np.int64).tolist():
+        for begin in (
+            np.linspace(fields.start, size, NUM_SAMPLED_PLACES, endpoint=False).astype(np.int64).tolist()
+        ):
             file.seek(begin)
             lines = file.read(SAMPLE_SIZE).splitlines()
             blocks.append(lines[begin > fields.start : -1] or lines[:1])
     if not is_plain:
-        blocks = [next(text_blocks(path, HEAD_SIZE), b"")[fields.start :].splitlines()[:-1]]
+        blocks = [next(text_blocks(path, TEXT_HEAD_SIZE), b"")[fields.start :].splitlines()[:-1]]
     rows = []
     for line in (line for block in blocks for line in block):
         numbers = split(fields.spelling.plain(line), fields.delimiter)
@@ -161,7 +163,7 @@ def read_samples(path: Path, fields: Fields, num_columns: int) -> Array:
 def drop_broken(rows: Array) -> Array:
     """Return rows (R, C) without those in which a number is missing that few others miss."""
     is_broken = ~np.isfinite(rows)
-    return rows[~is_broken[:, np.mean(is_broken, axis=0) < FEW].any(axis=1)] if len(rows) else rows
+    return rows[~is_broken[:, np.mean(is_broken, axis=0) < FEW_ROWS].any(axis=1)] if len(rows) else rows
 
 
 def names_of_user(path: Path, settings: CloudSettings, num_columns: int) -> tuple[str, ...]:
@@ -210,7 +212,7 @@ def _count_indices(rows: Array) -> int:
 def _are_normals(rows: Array, num_free: int) -> bool:
     """Return True if vectors (R, 3) are normals: of length 1, and no saturated colours."""
     lengths = np.linalg.norm(rows, axis=1)
-    is_right = (np.abs(lengths - 1.0) < UNIT_LENGTH) | (lengths == 0.0)
+    is_right = (np.abs(lengths - 1.0) < NORMAL_LENGTH_ERROR) | (lengths == 0.0)
     can_be = num_free > len(NORMAL) or bool((rows < 0.0).any()) or bool((rows % 1.0 != 0.0).any())
     return can_be and bool(lengths.any()) and float(np.mean(is_right)) >= MOST_ROWS
 
@@ -228,7 +230,7 @@ def _find_colors(rows: Array) -> int | None:
         return None
     spreads = {k: float(np.mean(np.ptp(rows[:, k : k + 3], axis=1))) if len(rows) else 0.0 for k in found}
     if rows.shape[1] == len(BARE) and 1 in found:
-        return 0 if spreads.get(0, np.inf) * FAR < spreads[1] else 1
+        return 0 if spreads.get(0, np.inf) * FAR_FACTOR < spreads[1] else 1
     return min(found, key=lambda k: spreads[k])
 
 

@@ -87,7 +87,7 @@ class Tracker:
     def prepare(self, panorama: Panorama) -> Problem:
         """Prepare the problem of a frame, with the images that its descents need."""
         settings = self.settings
-        problem = prepare_problem(panorama, self.scan_map, settings.prior, settings.gravity)
+        problem = prepare_problem(panorama, self.scan_map, settings.prior, settings.gravity, settings.method)
         for image in problem.photo.images:
             image()
         return problem
