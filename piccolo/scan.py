@@ -1,10 +1,11 @@
 """The public class `Scan`: photos, bundles of photos and walks are localized in it."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache, partial
 from itertools import repeat
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from .arguments import check_kind, check_one_each
 from .arrays import Bytes, Floats
@@ -14,7 +15,6 @@ from .errors import InputError
 from .evidence.occlusion import occlusion_mask
 from .files.atomic import check_output
 from .geometry.pose import Gravity, Pose, check_pose
-from .jobs.memory import check_memory
 from .jobs.threads import Stopwatch, Workers
 from .judge.probability import LOCALIZED
 from .judge.result import Result, nothing_found
@@ -26,17 +26,27 @@ from .paper.localize import PaperMap, PaperSettings, localize as localize_by_pap
 from .photo import File, Photo, Prior, as_photo
 from .photo_reader import PhotoReader, Settings
 from .problem.settings import CoarseToFineSettings
+from .scan_bundle import localize_posed
 from .scan_map.open_map import write_map
 from .scan_map.scan_map import ScanMap, check_within
 from .scan_walk import Walk
-from .together.bundle import localize_bundle
-from .together.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
+from .second_look import Looking, Place
+from .together.beside import SurePhoto
+from .together.bundle_adjustment import RelativeScale
+from .together.second_looks import MOST_PICTURES, Look, localize_in_order
 from .together.walk.frames import Motion
 from .together.walk.tracker import Tracker
 
-MEMORY_OF_PHOTO = 8e7  # [byte] that a photo keeps while others of its bundle are localized
+BESIDE = "photos beside others"
 ONLY_DEFAULT = ("refine_focal", "gravity_vector")  # options of photos that the preset paper does not have
 Picture = File | Bytes | Photo  # a path or an array (H, W, 3) is a photo without options
+
+
+class Asked(NamedTuple):
+    """A photo, and the settings by which it is to be localized."""
+
+    photo: Photo
+    settings: Settings
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -175,27 +185,69 @@ class Scan:
     ) -> Iterator[Result]:
         """Return an iterator over the results of photos, in order; each is computed when it is asked for.
 
+        Photos in a sequence, as a list, help each other, as those of one command line: one of a part of the
+        sphere gets a second look, with the focal length that others of its camera have, or beside others that
+        are sure. Results from the first that may still change wait for that. Photos of any other iterable
+        are each localized alone.
+
         `prior` is one of all photos, or a list with one of each. The status of a photo that can't be read is
         "unreadable", or "failed" if another try may succeed; `error` says why.
         """
         check_kind("photos", photos, Iterable[Picture])
         check_kind("prior", prior, Prior | Sequence[Prior | None] | None)
+        may_help = isinstance(photos, Sequence) and isinstance(self.prepared, ScanMap)
         priors: Iterable[Prior | None] = repeat(prior) if prior is None or isinstance(prior, Prior) else prior
         if isinstance(prior, Sequence):
             photos = list(photos)
             check_one_each("prior", prior, len(photos), "photo")
-        self._change(None, gravity, min_confidence)  # refused before the first photo is asked for
+        settings = self._change(None, gravity, min_confidence)  # refused before the first photo is asked for
+        own = (
+            Asked(as_photo(photo), self._change(prior, gravity, min_confidence))
+            for photo, prior in zip(photos, priors, strict=False)
+        )
+        if not may_help:
+            return map(self.try_photo, own)
+        return self.localize_in_order(list(own), settings.min_confidence)
 
-        def localize(picture: Picture, prior: Prior | None) -> Result:
-            photo = as_photo(picture)
-            settings = self._change(prior, gravity, min_confidence)
-            self.check_options(photo, settings)
-            try:
-                return self.localize_photo(photo, settings)
-            except Exception as error:
-                return self.reader.make_failed(photo, error, settings)
+    def localize_in_order(self, asked: Sequence[Asked], min_confidence: float) -> Iterator[Result]:
+        """Localize photos that help each other; yield results in order, each when it is final."""
+        known: dict[tuple[str, str | None], Asked] = {}  # by name and digest
 
-        return map(localize, photos, priors)
+        @lru_cache(MOST_PICTURES)
+        def place(result: Result) -> SurePhoto | None:
+            return self.place_keypoints(known[result.pano, result.source.pano_sha256], result)
+
+        def localize(one: Asked) -> Result:
+            result = self.try_photo(one)
+            known[result.pano, result.source.pano_sha256] = one
+            return result
+
+        def look_again(one: Asked, look: Look) -> Result:
+            return self.try_photo(one, partial(self.look_again, look=look, place=place))
+
+        return localize_in_order(asked, localize, look_again, min_confidence)
+
+    def try_photo(self, asked: Asked, localize: Callable[[Asked], Result] | None = None) -> Result:
+        """Localize a photo, by default alone; of one that can't be read return why.
+
+        Raises InputError for an option that this scan does not have.
+        """
+        self.check_options(*asked)
+        try:
+            return localize(asked) if localize else self.localize_photo(*asked)
+        except Exception as error:
+            return self.reader.make_failed(asked.photo, error, asked.settings)
+
+    def look_again(self, asked: Asked, look: Look, place: Place) -> Result:
+        """Localize a photo again: with the focal length that others tell, or beside others."""
+        scan_map, settings = self.require_default_method(BESIDE, asked.settings)
+        first = look.first or self.localize_photo(asked.photo, settings, look.focal)
+        return Looking(scan_map, self.reader, self.workers).look(asked.photo, first, look, place, settings)
+
+    def place_keypoints(self, asked: Asked, result: Result) -> SurePhoto | None:
+        """Return the keypoints of a photo that is localized; None if it is another, or none, by now."""
+        scan_map, settings = self.require_default_method(BESIDE, asked.settings)
+        return Looking(scan_map, self.reader, self.workers).place(asked.photo, result, settings)
 
     def localize_bundle(
         self,
@@ -223,25 +275,7 @@ class Scan:
         for photo in given:
             self.check_options(photo, settings)
         poses = [check_pose(pose, "`relative_poses`") for pose in relative_poses]
-        if not given:
-            return []
-        watch = Stopwatch()
-        needed = len(given) * MEMORY_OF_PHOTO
-        check_memory(needed, f"{len(given)} photos together", "localize fewer together")
-        reader = self.reader
-        taken = [reader.take(photo, watch) for photo in given]
-        pictures = [picture for picture, _ in taken]
-        if any(map(has_guessed_focal, pictures)):
-            raise InputError("`relative_poses`: found a focal length that is a guess, wanted a known one")
-        errors = RelativeErrors()
-        if relative_scale == "unknown":
-            errors = errors._replace(log_scale=UNKNOWN_SCALE)
-        found = localize_bundle(scan_map, pictures, poses, settings, self.workers, watch, errors)
-        seconds = {stage: spent / len(found) for stage, spent in watch.seconds.items()}
-        return [
-            add_places(scan_map, one).complete(reader.make_blank(photo, picture, facts, settings, seconds))
-            for photo, (picture, facts), one in zip(given, taken, found, strict=True)
-        ]
+        return localize_posed(scan_map, self.reader, self.workers, given, poses, relative_scale, settings)
 
     def track(
         self,

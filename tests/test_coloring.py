@@ -217,7 +217,7 @@ def test_a_stranger_is_not_localized_by_its_own_paint(tmp_path, monkeypatch):
         panorama = rooms.as_panorama(photos[k][0])
         found = rooms.locate(panorama, painted, settings)
         about = {name: getattr(found, name) for name in ("status", "confidence", "covariance")}
-        return replace(by_shape[k], best_pose=found.pose, **about)
+        return replace(by_shape[k], best_pose=found.best_pose, **about)
 
     results = localize_by_colors(scan_map, by_shape, localize_one, Workers(2), Journal())
     assert [result.status for result in results] == ["localized"] * 2 + ["not_localized"]

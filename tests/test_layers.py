@@ -27,6 +27,7 @@ LAYERS = [
     "opening",
     "scan",
     "scan_walk",
+    "scan_bundle",
     "second_look",
     "photo_reader",
     "coloring",

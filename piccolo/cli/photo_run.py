@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..batch.inputs import describe_left_out, is_from_stdin, list_panoramas, read_priors
-from ..batch.localizer import LISTINGS, Answer, Localizer, Look, list_changed_by_consensus
+from ..batch.localizer import Answer, Localizer
 from ..batch.results_file import FileOutput, Output, Records, StreamOutput
 from ..errors import InputError
 from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, temporary_folder, write_atomically
@@ -23,7 +23,7 @@ from ..files.line_file import open_locked, write_line
 from ..jobs.memory import limit_memory
 from ..jobs.threads import Stopwatch, num_cores
 from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
-from ..judge.result import FAILED, UNREADABLE
+from ..judge.result import FAILED, UNREADABLE, Result
 from ..panorama import read_panorama
 from ..panorama.cube import is_cube
 from ..panorama.masks import find_mask
@@ -32,6 +32,7 @@ from ..problem.settings import CoarseToFineSettings
 from ..scan import Scan
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
+from ..together.second_looks import LISTINGS, Change, Look, follow_cameras, revise
 from ..views.pictures import encode_image
 from . import execution, terminal, together
 from .command import Arguments, UsageError, check_distinct, check_suffix, checking_options
@@ -225,51 +226,45 @@ def localize_all(
     return interruption
 
 
-def follow_consensus(run: Run, output: Output) -> Sequence[str]:
-    """Change results by what all photos of a camera say of its focal length; return the lines."""
-    settings = run.localizer.settings
-    if not isinstance(settings, CoarseToFineSettings):
-        return output.texts()
-    for number, status, result in list_changed_by_consensus(output.texts(), settings.min_confidence):
-        replace_line = partial(output.replace, number)
-        if result.status == status:
-            replace_line(result.to_json())
-        else:
-            run.counts[status] -= 1
-            record(run, Answer(result, result.warnings), replace_line)
-    return output.texts()
+def record_change(run: Run, change: Change, answer: Answer, output: Output) -> None:
+    """Replace a result by what others have made of it, and say so if that is news."""
+    replace_line = partial(output.replace, change.number)
+    if change.is_news:
+        run.counts[change.before.status] -= 1
+        record(run, answer, replace_line)
+    else:
+        replace_line(change.after.to_json())
+
+
+def follow_all_cameras(run: Run, results: list[Result], output: Output) -> None:
+    """Change results by what all photos of a camera say of its focal length."""
+    for change in follow_cameras(results, run.localizer.settings.min_confidence):
+        record_change(run, change, Answer(change.after, change.after.warnings), output)
 
 
 def look_again(run: Run, executor: Executor, output: Output) -> Interruption:
     """Look again at photos, with what others say of their camera, then beside others, until a signal."""
     localizer = run.localizer
-    for list_looks in LISTINGS:
-        looks = list_looks(follow_consensus(run, output))
-        tasks = (localizer.task(Path(look.pano))._replace(look=look) for look in looks)
-        bar: dict[str, Any] = {"desc": "second look", "total": len(looks), "unit": ""}
-        show = partial(terminal.show_progress, is_quiet=run.arguments.quiet, **bar)
-        with execution.interruptible() as interruption:
+    answered: dict[int, Answer] = {}
+    with execution.interruptible() as interruption:
+
+        def ask(looks: Sequence[Look]) -> Iterator[Result]:
+            if interruption.number:
+                return
+            tasks = (localizer.task(Path(look.pano))._replace(look=look) for look in looks)
+            bar: dict[str, Any] = {"desc": "second look", "total": len(looks), "unit": ""}
+            show = partial(terminal.show_progress, is_quiet=run.arguments.quiet, **bar)
             answers = execution.answer_all(executor, localizer, tasks, show, interruption, run.cloud_sha256)
             for look, answer in zip(looks, answers, strict=False):
-                record_second(run, look, answer, output)
-        if interruption.number:
-            return interruption
-    follow_consensus(run, output)
+                if answer.result.error is not None:
+                    run.arguments.error(answer.result.error)
+                answered[look.number] = answer
+                yield answer.result
+
+        for change in revise(output.results(), ask, localizer.settings.min_confidence):
+            answer = answered.pop(change.number, None) or Answer(change.after, change.after.warnings)
+            record_change(run, change, answer, output)
     return interruption
-
-
-def record_second(run: Run, look: Look, answer: Answer, output: Output) -> None:
-    """Replace a result by that of a second look; if that failed, say why."""
-    result = answer.result
-    replace_line = partial(output.replace, look.number)
-    is_other = not look.first or (result.beside is not None and result.beside.photos)
-    if result.error is not None:
-        run.arguments.error(result.error)
-    elif is_other:
-        run.counts[look.status] -= 1
-        record(run, answer, replace_line)
-    else:
-        replace_line(result.to_json())
 
 
 def note_left_handed(run: Run, records: Records, executor: Executor, interruption: Interruption) -> None:
@@ -353,8 +348,9 @@ def localize_photos(arguments: Arguments) -> int:
             left = iter(known)
             num_left = len(known)
         first = next(left, None)
-        texts = follow_consensus(run, output) if first is None and run.looks_again else []
-        looks = [look for list_looks in LISTINGS for look in list_looks(texts)]
+        results = output.results() if first is None and run.looks_again else []
+        follow_all_cameras(run, results, output)
+        looks = [look for list_looks in LISTINGS for look in list_looks(results)]
         if first is None and not looks:
             arguments.note(f"{arguments.out or 'nothing'}: nothing is left to do")
             return finish(run, records, output, Interruption(), 0.0)
