@@ -5,30 +5,39 @@ from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
 from itertools import repeat
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
+
+import numpy as np
 
 from .arguments import check_kind, check_one_each
 from .arrays import Bytes, Floats
 from .cloud.settings import CloudSettings
 from .cloud.soa import PackedPoints
+from .coloring.color_scan import (
+    OF_RESULTS,
+    Coloring,
+    check_files,
+    check_suffix,
+    color_if_enough,
+    localize_for_colors,
+)
 from .errors import InputError
 from .evidence.occlusion import occlusion_mask
 from .files.atomic import check_output
+from .files.line_file import Journal
 from .geometry.pose import Gravity, Pose, check_pose
-from .jobs.threads import Stopwatch, Workers
-from .judge.probability import LOCALIZED
-from .judge.result import Result, nothing_found
+from .jobs.threads import Workers
+from .judge.result import Result
 from .judge.result_parts import FocalLength
-from .localization.localize import has_guessed_focal, localize, localize_guessed
-from .localization.means import NO_TRACE, Means, Trace
-from .localization.places import add_places
-from .paper.localize import PaperMap, PaperSettings, localize as localize_by_paper
+from .localization.means import NO_TRACE, Trace
+from .paper.localize import PaperMap
 from .photo import File, Photo, Prior, as_photo
 from .photo_reader import PhotoReader, Settings
 from .problem.settings import CoarseToFineSettings
 from .scan_bundle import localize_posed
 from .scan_map.open_map import write_map
 from .scan_map.scan_map import ScanMap, check_within
+from .scan_photo import Asked, localize_photo
 from .scan_walk import Walk
 from .second_look import Looking, Place
 from .together.beside import SurePhoto
@@ -40,13 +49,6 @@ from .together.walk.tracker import Tracker
 BESIDE = "photos beside others"
 ONLY_DEFAULT = ("refine_focal", "gravity_vector")  # options of photos that the preset paper does not have
 Picture = File | Bytes | Photo  # a path or an array (H, W, 3) is a photo without options
-
-
-class Asked(NamedTuple):
-    """A photo, and the settings by which it is to be localized."""
-
-    photo: Photo
-    settings: Settings
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -135,45 +137,14 @@ class Scan:
         >>> scan.localize(photo, prior=piccolo.Prior(height=(1.0, 1.5))).status
         'localized'
         """
-        return self.localize_photo(as_photo(photo), self._change(prior, gravity, min_confidence))
+        return self.localize_photo(Asked(as_photo(photo), self._change(prior, gravity, min_confidence)))
 
     def localize_photo(
-        self,
-        photo: Photo,
-        settings: Settings,
-        focal: FocalLength | None = None,
-        trace: Trace = NO_TRACE,
+        self, asked: Asked, focal: FocalLength | None = None, trace: Trace = NO_TRACE
     ) -> Result:
-        """Localize a photo by settings of the scan's method, as all that ask for one photo do.
-
-        `focal` is its focal length as found with those of others, which counts then. `trace` notes the steps
-        of the default method.
-        """
-        watch = Stopwatch()
-        self.check_options(photo, settings)
-        reader = self.reader
-        picture, facts = reader.take(photo, watch, focal)
-        gps = None
-        if isinstance(self.prepared, PaperMap):
-            assert isinstance(settings, PaperSettings)
-            found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
-        else:
-            assert isinstance(settings, CoarseToFineSettings)
-            gps = reader.make_gps_prior(facts, settings.prior)
-            run = localize_guessed if has_guessed_focal(picture) else localize
-            means = Means(settings.effort, self.workers, watch, trace)
-            found = nothing_found()
-            if gps is not None:
-                near = replace(settings, prior=gps.apply_to(settings.prior))
-                found = run(self.prepared, picture, near, means)
-            if found.status != LOCALIZED:
-                gps = gps and replace(gps, is_used=False)
-                found = run(self.prepared, picture, settings, means)
-            found = add_places(self.prepared, found)
-        if focal is not None:
-            found = replace(found, focal_length=focal.update(found.focal_length))
-        blank = reader.make_blank(photo, picture, facts, settings, watch.seconds)
-        return replace(found.complete(blank), gps_prior=gps)
+        """Localize a photo by settings of the scan's method, as all who ask for one do (`localize_photo`)."""
+        self.check_options(*asked)
+        return localize_photo(self.prepared, self.reader, self.workers, asked, focal, trace)
 
     def localize_many(
         self,
@@ -234,14 +205,14 @@ class Scan:
         """
         self.check_options(*asked)
         try:
-            return localize(asked) if localize else self.localize_photo(*asked)
+            return localize(asked) if localize else self.localize_photo(asked)
         except Exception as error:
             return self.reader.make_failed(asked.photo, error, asked.settings)
 
     def look_again(self, asked: Asked, look: Look, place: Place) -> Result:
         """Localize a photo again: with the focal length that others tell, or beside others."""
         scan_map, settings = self.require_default_method(BESIDE, asked.settings)
-        first = look.first or self.localize_photo(asked.photo, settings, look.focal)
+        first = look.first or self.localize_photo(asked, look.focal)
         return Looking(scan_map, self.reader, self.workers).look(asked.photo, first, look, place, settings)
 
     def place_keypoints(self, asked: Asked, result: Result) -> SurePhoto | None:
@@ -276,6 +247,40 @@ class Scan:
             self.check_options(photo, settings)
         poses = [check_pose(pose, "`relative_poses`") for pose in relative_poses]
         return localize_posed(scan_map, self.reader, self.workers, given, poses, relative_scale, settings)
+
+    def color(
+        self,
+        photos: Iterable[Picture],
+        out: File,
+        *,
+        prior: Prior | None = None,
+        gravity: Gravity | None = None,
+        min_confidence: float | None = None,
+    ) -> Coloring:
+        """Localize photos, again in each other's colours, and write the scan in their colours to `out`.
+
+        Its suffix is .ply, .las, .laz or .e57. Raises InputError for a scan that is not of files.
+        """
+        check_kind("photos", photos, Iterable[Picture])
+        check_kind("out", out, File)
+        settings = self._change(prior, gravity, min_confidence)
+        scan_map, settings = self.require_default_method("color", settings)
+        asked = [Asked(as_photo(photo), settings) for photo in photos]
+        path = Path(out)
+        files = [Path(name) for name in ([self.name] if isinstance(self.name, str) else self.name)]
+        check_files(files)
+        check_suffix(path)
+        check_output(path)
+        if any(isinstance(one.photo.picture, np.ndarray) for one in asked):
+            raise InputError("`photos`: found an array, wanted files, which are read again for their colours")
+
+        def localize(shown: ScanMap, k: int) -> Result:
+            result = replace(self, prepared=shown).try_photo(asked[k])
+            return replace(result, settings={**result.settings, **OF_RESULTS})
+
+        steps = [one.photo.name for one in asked]
+        results = localize_for_colors(scan_map, steps, localize, len(asked), self.workers, Journal())
+        return color_if_enough(files, scan_map, self.cloud_settings, results, path, self.workers)
 
     def track(
         self,

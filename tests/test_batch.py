@@ -231,10 +231,10 @@ class Short(module.Localizer):
         scan = super().open_scan(workers)
         ask = type(scan).localize_photo
 
-        def localize(self, photo, *more, **noted):
-            if error := Short.errors.pop(photo.path.name, None):
+        def localize(self, asked, *more, **noted):
+            if error := Short.errors.pop(asked.photo.path.name, None):
                 raise error
-            return ask(self, photo, *more, **noted)
+            return ask(self, asked, *more, **noted)
 
         return type("Scan", (type(scan),), {"localize_photo": localize})(**vars(scan))
 

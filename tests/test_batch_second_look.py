@@ -159,10 +159,11 @@ def looked(monkeypatch):
     """What is looked at again; b and d are not sure before, and d is not after."""
     ask, known, looked = Scan.localize_photo, {}, Looked([], {})
 
-    def localize(self, photo, *more, **noted):
+    def localize(self, asked, *more, **noted):
+        photo = asked.photo
         content = photo.path.read_bytes()
         if content not in known:
-            known[content] = ask(self, photo, *more, **noted)
+            known[content] = ask(self, asked, *more, **noted)
         found = replace(known[content], pano=photo.name)
         is_sure = photo.path.name not in ("b.jpg", "d.jpg")
         status = found.status if is_sure else "ambiguous"

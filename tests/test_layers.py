@@ -28,6 +28,7 @@ LAYERS = [
     "scan",
     "scan_walk",
     "scan_bundle",
+    "scan_photo",
     "second_look",
     "photo_reader",
     "coloring",

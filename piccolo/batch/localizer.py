@@ -24,9 +24,10 @@ from ..opening import open_files
 from ..photo import Photo, Vector
 from ..photo_reader import Settings, settings_json, unreadable_result
 from ..problem.settings import CoarseToFineSettings
-from ..scan import Asked, Scan
+from ..scan import Scan
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
+from ..scan_photo import Asked
 from ..second_look import Place
 from ..together.beside import SurePhoto
 from ..together.second_looks import MOST_PICTURES, Look
@@ -165,7 +166,7 @@ class Localizer:
         with task.place(self.folder) as photo, reading_once():
             try:
                 if task.look is None:
-                    found = scan.localize_photo(photo, task.settings, trace=trace)
+                    found = scan.localize_photo(Asked(photo, task.settings), trace=trace)
                 else:
                     found = scan.look_again(Asked(photo, task.settings), task.look, place_keypoints)
                 overlay, mask = self._pictures(scan, photo, found)

@@ -171,21 +171,14 @@ def make_coloring_job(arguments: Arguments, photos: Sequence[Path], localizer: L
     scan_map = scan.prepared
     assert isinstance(scan_map, ScanMap)
     given = {str(path): localizer.ask(path)[0] for path in photos}
-    more = {"colors": "those of the other photos"}
 
     def localize(shown: ScanMap, k: int) -> Result:
         result = localizer.answer_in(replace(scan, prepared=shown))(localizer.task(photos[k])).result
-        return replace(result, settings={**result.settings, **more})
+        return replace(result, settings={**result.settings, **color_scan.OF_RESULTS})
 
     def run(journal: Journal) -> list[Result]:
         steps = (f"shape: {path} {sha256_of(path, localizer.photo.instant)}" for path in photos)
-        by_shape = journal.recall(steps, lambda _, text: Result.from_json(text))
-        left = range(len(by_shape), len(photos))
-        for k in scan.workers.show(iter(left), len(left), "photos"):
-            by_shape.append(localize(scan_map, k))
-            step = f"shape: {photos[k]} {by_shape[k].source.pano_sha256}"
-            color_scan.keep_step(journal, step, by_shape[k])
-        return color_scan.localize_by_colors(scan_map, by_shape, localize, scan.workers, journal)
+        return color_scan.localize_for_colors(scan_map, steps, localize, len(photos), scan.workers, journal)
 
     def report(results: Sequence[Result]) -> tuple[str, bool]:
         of_scan = {*scan.warnings, color_scan.PAINTED}
@@ -201,7 +194,7 @@ def make_coloring_job(arguments: Arguments, photos: Sequence[Path], localizer: L
         part = 100.0 * colored.num_colored / max(colored.num_points, 1)
         return f"; {part:.0f} % of the points coloured", True
 
-    fields = localizer.expect(scan_map.scan_sha256, more)
+    fields = localizer.expect(scan_map.scan_sha256, color_scan.OF_RESULTS)
     return Job("photos", given, fields, run, report, arguments.color_scan)
 
 
