@@ -1,7 +1,7 @@
 """Answers to the photos of a batch, in this process or where else the scan is opened."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -30,7 +30,7 @@ from ..scan_map.open_map import CachePolicy
 from ..scan_photo import Asked
 from ..second_look import Place
 from ..together.beside import SurePhoto
-from ..together.second_looks import MOST_PICTURES, Look
+from ..together.second_looks import MOST_PICTURES, Look, localize_in_order
 from ..views.pictures import encode_image, overlay_png
 from .inputs import PriorTable
 
@@ -50,11 +50,15 @@ class Task(NamedTuple):
             yield replace(self.photo, picture=folder / self.photo.path)
             return
         with temporary_folder() as temporary:
-            for name, content in self.files.items():
-                path = temporary / name
-                path.parent.mkdir(parents=True, exist_ok=True)
-                write_temporary(path, content)
+            self.write_files(temporary)
             yield replace(self.photo, picture=temporary / self.photo.path.name)
+
+    def write_files(self, folder: Path) -> None:
+        """Write the files that the task has into a folder."""
+        for name, content in (self.files or {}).items():
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_temporary(path, content)
 
 
 def files_of(pano: Path) -> dict[str, bytes]:
@@ -181,6 +185,20 @@ class Localizer:
         photo, settings = self.ask(Path(result.pano))
         photo = replace(photo, picture=self.folder / photo.path)
         return scan.place_keypoints(Asked(photo, settings), result)
+
+    def answer_together(self, scan: Scan, tasks: Sequence[Task]) -> list[Result]:
+        """Localize photos that were sent together, of the same options, and help each other."""
+        with temporary_folder() as folder:
+            for task in tasks:
+                task.write_files(folder)
+            photo, settings = tasks[0][:2]
+            here = replace(self, folder=folder, photo=photo, settings=settings, priors=None)
+            answer = here.answer_in(scan)
+
+            def localize(task: Task, look: Look | None = None) -> Result:
+                return answer(task._replace(files=None, look=look)).result
+
+            return list(localize_in_order(tasks, localize, localize, settings.min_confidence))
 
     def give_up(self, task: Task, error: WorkerLostError, cloud_sha256: str | None) -> Answer:
         """Return the answer to a task whose workers were lost."""
