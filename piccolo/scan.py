@@ -34,7 +34,7 @@ from .paper.localize import PaperMap
 from .photo import File, Photo, Prior, as_photo
 from .photo_reader import PhotoReader, Settings
 from .problem.settings import CoarseToFineSettings
-from .scan_bundle import localize_posed
+from .scan_bundle import AskedPosed, localize_posed
 from .scan_map.open_map import write_map
 from .scan_map.scan_map import ScanMap, check_within
 from .scan_photo import Asked, localize_photo
@@ -245,8 +245,11 @@ class Scan:
         scan_map, settings = self.require_default_method("`relative_poses`", settings)
         for photo in given:
             self.check_options(photo, settings)
-        poses = [check_pose(pose, "`relative_poses`") for pose in relative_poses]
-        return localize_posed(scan_map, self.reader, self.workers, given, poses, relative_scale, settings)
+        asked = [
+            AskedPosed(photo, check_pose(pose, "`relative_poses`"), settings)
+            for photo, pose in zip(given, relative_poses, strict=True)
+        ]
+        return localize_posed(scan_map, self.reader, self.workers, asked, relative_scale)
 
     def color(
         self,

@@ -13,8 +13,8 @@ from batches import untimed
 from scans import read_cloud
 from scipy.spatial import cKDTree
 
+from piccolo.batch.jobs import steps_file
 from piccolo.cli import color_scan as tool, localize as command_line
-from piccolo.cli.together import steps_file
 from piccolo.cloud.octree import build_octree, recolor
 from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.writers import vertex_rows, write_colored, writing_e57

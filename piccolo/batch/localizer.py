@@ -173,7 +173,7 @@ class Localizer:
                     found = scan.localize_photo(Asked(photo, task.settings), trace=trace)
                 else:
                     found = scan.look_again(Asked(photo, task.settings), task.look, place_keypoints)
-                overlay, mask = self._pictures(scan, photo, found)
+                overlay, mask = self.make_pictures(scan, photo, found)
             except Exception as error:
                 return Answer(scan.reader.make_failed(photo, error, task.settings, name))
         warnings = tuple(warning.replace(photo.name, name) for warning in found.warnings)
@@ -207,7 +207,7 @@ class Localizer:
         about = {"settings": settings, "source": Source(cloud_sha256)}
         return Answer(unreadable_result(f"{name}: {error}", self.name, name, is_passing=True, **about))
 
-    def _pictures(self, scan: Scan, photo: Photo, result: Result) -> tuple[bytes | None, bytes | None]:
+    def make_pictures(self, scan: Scan, photo: Photo, result: Result) -> tuple[bytes | None, bytes | None]:
         """Overlay and occlusion mask as PNG, where they are asked for and there is a pose."""
         overlay = mask = None
         pose = result.best_pose
