@@ -27,6 +27,8 @@ LAYERS = [
     "opening",
     "scan",
     "scan_walk",
+    "scan_bundle",
+    "scan_photo",
     "second_look",
     "photo_reader",
     "coloring",

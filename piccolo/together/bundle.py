@@ -28,7 +28,7 @@ from ..judge.result import Result, nothing_found
 from ..localization.calibration import calibrate
 from ..localization.judging import Found, judge, judge_together
 from ..localization.localize import explain_nothing, find, find_by_edges, prepare_search
-from ..localization.means import Means
+from ..localization.means import NO_TRACE, Means, Trace
 from ..panorama import Panorama
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
@@ -73,40 +73,47 @@ class Agreed(NamedTuple):
     warnings: tuple[str, ...]
 
 
+class Posed(NamedTuple):
+    """A photo whose pose relative to others is known."""
+
+    panorama: Panorama
+    cam_from_bundle: Pose  # in any common frame
+    settings: CoarseToFineSettings
+    trace: Trace = NO_TRACE
+
+
 @one_blas_thread()
 def localize_bundle(
-    scan_map: ScanMap,
-    panoramas: Sequence[Panorama],
-    cams_from_bundle: Sequence[Pose],
-    settings: CoarseToFineSettings,
-    workers: Workers,
-    watch: Stopwatch,
-    errors: RelativeErrors,
+    scan_map: ScanMap, posed: Sequence[Posed], workers: Workers, watch: Stopwatch, errors: RelativeErrors
 ) -> list[Result]:
-    """Localize photos together; `cams_from_bundle` are their poses in any common frame.
+    """Localize photos together; those of all settings but their priors and traces are alike.
 
-    `errors` are those expected of these poses; their scale is unknown if its deviation is large.
+    `errors` are those expected of the poses; their scale is unknown if its deviation is large.
     """
-    cams_from_bundle = move_origin_near(cams_from_bundle)
+    cams_from_bundle = move_origin_near([one.cam_from_bundle for one in posed])
     members: dict[int, Member] = {}
-    means = Means(settings.effort, workers, watch)
 
     def localize_alone(k: int, panorama: Panorama) -> Result:
+        settings = posed[k].settings
         problem = prepare_search(scan_map, panorama, settings, watch)
         if problem is None:
             return explain_nothing(scan_map, panorama, settings.prior)
         search = find_by_edges if problem.profile.follows_walls else find
+        means = Means(settings.effort, workers, watch, posed[k].trace)
         found = search(problem, scan_map, means)
         judged = judge(found, means, settings.min_confidence, may_promote=False)
         members[k] = Member(found.forget(), judged, cams_from_bundle[k])
         return judged
 
+    panoramas = [one.panorama for one in posed]
     alone = [localize_alone(k, panorama) for k, panorama in enumerate(panoramas)]
     for k, panorama in expect_focal(panoramas, alone).items():
         members.pop(k, None)
         alone[k] = localize_alone(k, panorama)
     members = dict(sorted(members.items()))
+    settings = posed[0].settings
     with watch.stage("refine"):
+        means = Means(settings.effort, workers, watch)
         together = judge_members(members, errors, means, settings.min_confidence)
     return [together.get(k, one) for k, one in enumerate(alone)]
 
