@@ -20,6 +20,10 @@ class Expected(NamedTuple):
     reach: float  # [m] from there
     pose: Pose  # predicted
 
+    def is_within(self, pose: Pose) -> bool:
+        """Return True for a pose within reach."""
+        return pose.distance(self.last) <= self.reach
+
 
 class Start(NamedTuple):
     """A pose from which a frame is tracked."""
@@ -65,7 +69,7 @@ def predict(last: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pos
 def list_alike(expected: Expected, places: Sequence[Place]) -> list[Pose]:
     """Return the places within reach that look hardly worse than the best one, as copies do."""
     alike = [pose for pose, behind in places if behind > -COPY_LOG_ODDS]
-    return [pose for pose in alike if pose.distance(expected.last) <= expected.reach]
+    return [pose for pose in alike if expected.is_within(pose)]
 
 
 def list_starts(expected: Expected, behind: float, alike: Sequence[Pose], is_narrow: bool) -> list[Start]:
@@ -83,7 +87,7 @@ def is_acceptable(state: State, expected: Expected, must_be_sure: bool) -> bool:
     """Return True for a pose within reach that is sure by itself or, if it need not be, was expected."""
     is_expected = not must_be_sure and ONE_PLACE.holds(state.pose, expected.pose)
     is_sure = state.log_odds >= MOST_EXPECTED or is_expected
-    return is_sure and state.pose.distance(expected.last) <= expected.reach
+    return is_sure and expected.is_within(state.pose)
 
 
 def describe_end(end: State, expected: Expected, alike: Sequence[Pose]) -> Followed:

@@ -18,7 +18,7 @@ from ...arrays import Array
 from ...errors import InputError
 from ...geometry.nearness import ONE_ANSWER
 from ...geometry.pose import Pose
-from ...geometry.pose_gaussian import PoseGaussian
+from ...geometry.pose_gaussian import PoseGaussian, probability_within
 from ...judge.candidate import Candidate
 from ...judge.localization import Localization
 from ...judge.probability import LOCALIZED
@@ -43,11 +43,17 @@ class State:
     gaussian: PoseGaussian | None = None  # the pose with its covariance, in the map
     end: Candidate | None = None  # where the photo was tracked to; None of one that was searched
     gain: float = 0.0  # [log] of one that was found among the few places within reach
+    local: float = 0.0  # probability that it is a local optimum beside the right pose, if its place is right
 
     @property
     def is_refined(self) -> bool:
         """True if the pose is as good as that of a photo alone."""
         return self.score is not None
+
+    @property
+    def within(self) -> float:
+        """Probability that the pose is within 0.1 m, if its place is right."""
+        return (1.0 - self.local) * probability_within(self.gaussian)
 
 
 @dataclass

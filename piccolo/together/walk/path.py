@@ -293,6 +293,11 @@ class Ranked(NamedTuple):
         """True if the first pose more likely is right than not."""
         return len(self.states) > 0 and self.states[0].is_refined and bool(self.probabilities[0] > EVEN)
 
+    @property
+    def confidence(self) -> float:
+        """Probability of the first pose; 0 if there is none."""
+        return float(self.probabilities[0]) * self.states[0].within if self.states else 0.0
+
 
 NOTHING = Ranked([], np.empty(0))
 

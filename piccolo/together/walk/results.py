@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice, pairwise
+from itertools import groupby, islice, pairwise
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from ...arguments import MIN_CONFIDENCE
 from ...arrays import Array
 from ...evidence.contradictions import contradictions
 from ...geometry.pose import Pose, carry
-from ...geometry.pose_gaussian import PoseGaussian, add, probability_within
+from ...geometry.pose_gaussian import PoseGaussian, add
 from ...jobs.threads import Progress, no_progress, one_blas_thread
 from ...judge.alternatives import MAX_ALTERNATIVES
 from ...judge.belief import make_belief
@@ -29,12 +29,14 @@ from ...judge.probability import LOCALIZED
 from ...judge.reasons import explain
 from ...problem.problem import Problem
 from .expectation import Expected, Followed
+from .following import find_near, refine_state
 from .frames import Frame
 from .path import EVEN, Gap, Path, Ranked, believe, build_lattice
-from .tracker import Tracker, find_near, refine_state
+from .tracker import Tracker
 
 LEAST_WALKED = 2.0  # [m] between frames by which an odometry is checked
 LEAST_RATIOS = 4  # of distances; fewer say nothing
+MOST_SEARCHED = 12  # frames of a run that are searched by themselves: as costly as to localize them alone
 TOLD_SCALE = 0.03  # error of an odometry's scale that is reported
 Find = Callable[[Problem], Followed | None]
 
@@ -121,10 +123,10 @@ def make_localization(tracker: Tracker, frame: Frame, ranked: Ranked) -> Localiz
     best, *others = ranked.states
     others = others[:MAX_ALTERNATIVES]
     scan_map = tracker.scan_map
-    is_own = frame.alone and frame.states and best is frame.states[0]
+    is_own = best.is_refined and best.end is None  # as only the search ends
     own = frame.alone if is_own and frame.alone else Localization()
     contradicted = contradictions(scan_map, best.pose, tracker.settings.prior)
-    belief = make_belief(ranked.probabilities[: 1 + len(others)], probability_within(best.gaussian))
+    belief = make_belief(ranked.probabilities[: 1 + len(others)], best.within)
     described = Localization(
         pose=scan_map.to_world(best.pose),
         loss=own.loss,
@@ -205,6 +207,14 @@ def finish(tracker: Tracker, show: Progress) -> tuple[Path, list[Ranked]]:
     The likely places of key frames are refined, frames that were tracked elsewhere are tracked there, and
     lost ones are looked for from sure ones.
     """
+    path, beliefs = _settle(tracker, show)
+    if _search_unsure(tracker, beliefs, show):
+        path, beliefs = _settle(tracker, show)
+    return path, beliefs
+
+
+def _settle(tracker: Tracker, show: Progress) -> tuple[Path, list[Ranked]]:
+    """Refine and track frames where their path leads; return it, and what each frame may be."""
     num = len(tracker.frames)
     path = _refine_likely(tracker, show)
     beliefs = [believe(tracker.frames, path, k) for k in range(num)]
@@ -212,6 +222,45 @@ def finish(tracker: Tracker, show: Progress) -> tuple[Path, list[Ranked]]:
         _find_lost(tracker, path, beliefs, k)
     path = _refine_likely(tracker, show)
     return path, [believe(tracker.frames, path, k) for k in range(num)]
+
+
+def _search_unsure(tracker: Tracker, beliefs: Sequence[Ranked], show: Progress) -> bool:
+    """Search frames by themselves that the walk leaves unsure; return True if that finds any.
+
+    A frame that was found stays as it is, unless the photo is sure by itself.
+    """
+    asked = list_unsure(tracker.frames, beliefs, tracker.settings.min_confidence)
+    is_any_found = False
+    for k in show(iter(asked), len(asked), "search"):
+        problem = tracker.problem_of(k)
+        if problem is None:
+            continue
+        searched = replace(tracker.frames[k])
+        tracker.search(problem, searched)
+        if searched.is_localized_alone or not tracker.frames[k].states:
+            tracker.frames[k] = searched
+            is_any_found |= searched.is_key
+        else:
+            tracker.frames[k].alone = searched.alone
+    return is_any_found
+
+
+def list_unsure(frames: Sequence[Frame], beliefs: Sequence[Ranked], min_confidence: float) -> list[int]:
+    """List frames that are not localized, and were not searched by themselves.
+
+    Of each run of such frames some are listed, evenly spread: what one of them finds, the others are found
+    from.
+    """
+    is_unsure = [
+        frame.alone is None and belief.confidence < min_confidence
+        for frame, belief in zip(frames, beliefs, strict=True)
+    ]
+    listed: list[int] = []
+    for is_asked, run in groupby(range(len(frames)), key=lambda k: is_unsure[k]):
+        numbers = list(run)
+        step = -(-len(numbers) // MOST_SEARCHED)
+        listed += numbers[step // 2 :: step] if is_asked else []
+    return listed
 
 
 def _refine_likely(tracker: Tracker, show: Progress) -> Path:
@@ -264,8 +313,13 @@ def _find_lost(tracker: Tracker, path: Path, beliefs: list[Ranked], k: int) -> N
         if found is None or not _is_walked(tracker, beliefs, k, found.state.pose):
             continue
         if found.is_alone or found.how == "tracked":
+            before = frames[k]
             _hang(frames, path, k, begin, found)
-            beliefs[k] = believe(frames, path, k)
+            belief = believe(frames, path, k)
+            if belief.confidence < beliefs[k].confidence:
+                frames[k] = before
+                continue
+            beliefs[k] = belief
             return
 
 
@@ -286,8 +340,10 @@ def _list_ways(tracker: Tracker, beliefs: Sequence[Ranked], k: int) -> list[tupl
     if frame.key is not None and belief.expected is not None:
         expected = Expected(belief.expected, tracker.motion.reach(0.0), belief.expected)
         ways = [(frame.key, partial(find_near, expected=expected, means=tracker.means))]
-    if not belief.is_sure and (sides := _list_sure(tracker.frames, beliefs, k)):
-        near = [(m, beliefs[m].states[0].pose) for m in sides[0]]
+    is_lost = belief.confidence < tracker.settings.min_confidence and not (frame.is_key and belief.is_sure)
+    if is_lost and (sides := _list_sure(tracker.frames, beliefs, k)):
+        nearest = [side[0] for side in sides] if len(sides) > 1 else sides[0]
+        near = [(m, beliefs[m].states[0].pose) for m in nearest]
         ways.append((sides[0][0], partial(tracker.find, frame=frame, near=near)))
     return ways
 
