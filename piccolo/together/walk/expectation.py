@@ -10,6 +10,7 @@ from ...geometry.pose import Pose, carry, exp_so3, log_so3
 from .frames import MOST_EXPECTED, Frame, How, Motion, State
 from .path import COPY_LOG_ODDS
 
+NUM_NARROW = 4  # chosen: places within reach from which a narrow photo is tracked
 Place = tuple[Pose, float]  # in the map, as rough as the grid of candidates; log odds against the frame's own
 
 
@@ -72,12 +73,16 @@ def list_alike(expected: Expected, places: Sequence[Place]) -> list[Pose]:
     return [pose for pose in alike if expected.is_within(pose)]
 
 
-def list_starts(expected: Expected, behind: float, alike: Sequence[Pose], is_narrow: bool) -> list[Start]:
+def list_starts(
+    expected: Expected, behind: float, alike: Sequence[Pose], is_narrow: bool, told: Sequence[Pose] = ()
+) -> list[Start]:
     """Return from where a frame is tracked, in order, until an end holds.
 
-    `behind` are the odds [log] by which the expected pose looks worse than the best place.
+    `behind` are the odds [log] by which the expected pose looks worse than the best place. A narrow photo,
+    of which views tell little, has more starts, of which `told` are those by other evidence.
     """
-    best = [Start(pose, False) for pose in alike[:1]]
+    others = [*filter(expected.is_within, told), *alike[:NUM_NARROW]] if is_narrow else alike[:1]
+    best = [Start(pose, False) for pose in others]
     if behind > -COPY_LOG_ODDS:
         return [Start(expected.pose, False), *best]
     return [*best, Start(expected.pose, True)] if is_narrow else best

@@ -3,42 +3,57 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from ...evidence.examine import complete, examine
 from ...evidence.verification import draw_near, verify
-from ...geometry.nearness import ONE_ANSWER
+from ...geometry.nearness import ONE_ANSWER, RIGHT
 from ...geometry.pose import Pose
 from ...geometry.pose_gaussian import PoseGaussian, probability_near
 from ...jobs.threads import Workers
 from ...judge.by_others import LOCAL_ERRORS, local_share
 from ...judge.candidate import Selection
 from ...judge.probability import posterior
-from ...judge.selection import assess
-from ...localization.beam import Ends, descend_briefly, score_mirror, score_near
+from ...judge.selection import CHANCE_MATCHES, assess
+from ...judge.sure import SURE_ODDS
+from ...local_features.hypotheses import propose_poses
+from ...localization.beam import descend_briefly, score_mirror, score_near
 from ...localization.means import Means
 from ...localization.near import Near, refine_near
 from ...problem.problem import Problem
 from ..beside import attach_by_matches, confirm, fuse_allowed
 from .expectation import Expected, Followed, describe_end, is_acceptable, list_alike, list_starts
 from .frames import MOST_EXPECTED, State, log_ratio, put_state
-from .path import COPY_LOG_ODDS
 from .places import list_places, log_behind, narrow_down
 
 LEAST_SCORE = 0.05  # of a tracked pose: with less it explains nothing
 
 
-def find_near(problem: Problem, expected: Expected, means: Means) -> Followed | None:
+class Told(NamedTuple):
+    """What is known of a narrow photo besides where it is expected."""
+
+    known: Sequence[Pose] = ()  # at which it was found before
+    beside: Sequence[PoseGaussian | None] = ()  # poses of the photos beside, with which it is matched
+
+
+NOTHING_TOLD = Told()
+
+
+def find_near(
+    problem: Problem, expected: Expected, means: Means, told: Told = NOTHING_TOLD
+) -> Followed | None:
     """Track a frame from the expected pose, if that looks hardly worse than the best place within reach.
 
     Else, or if that fails, it is tracked from that place. An end away from the expected pose counts only if
     the photo is sure of it by itself; and so does an end at an expected pose that looks worse, which is tried
-    last with a narrow photo, of which views tell little. None if none holds, or if the mirrored photo fits
-    better.
+    last with a narrow photo. That has more starts, until one end is sure; the likeliest counts. None if none
+    holds, or if the mirrored photo fits better.
     """
     near, effort = narrow_down(problem, expected.last, expected.reach, means.effort)
     workers = means.workers
+    is_narrow = problem.profile.is_narrow
     ends = descend_briefly(near, effort, workers)
     if not problem.profile.is_partial and score_mirror(near, effort, workers) > ends.best_score:
         return None
@@ -46,49 +61,49 @@ def find_near(problem: Problem, expected: Expected, means: Means) -> Followed | 
     best_score = max(ends.best_score, score)
     behind = log_behind(problem, score, best_score)
     alike = list_alike(expected, list_places(problem, ends, best_score))
-    for start in list_starts(expected, behind, alike, problem.profile.is_narrow):
+    others = [*propose_beside(problem, workers), *told.known] if is_narrow else []
+    held: list[State] = []
+    for start in list_starts(expected, behind, alike, is_narrow, others):
         end = track(problem, start.pose, workers)
         if end is not None and is_acceptable(end, expected, start.must_be_sure):
-            return describe_end(weigh_end(problem, near, end, ends, expected, workers), expected, alike)
-    return None
+            held.append(end)
+            if not is_narrow or end.log_odds >= SURE_ODDS:
+                break
+    if not held:
+        return None
+    best = choose_held(held)
+    share = 1.0
+    if problem.profile.is_partial:
+        best, share = join_beside(problem, best, told.beside)
+    return describe_end(replace(best, gain=share * compute_gain(problem, near)), expected, alike)
 
 
-def weigh_end(
-    problem: Problem, near: Problem, end: State, ends: Ends, expected: Expected, workers: Workers
-) -> State:
-    """Return an end with what it gains; that of a narrow photo may be a local optimum."""
-    if not problem.profile.is_partial:
-        return replace(end, gain=compute_gain(problem, near))
-    gain = compute_gain(problem, near, count_alike(problem, end.pose, ends, expected, workers))
-    return replace(end, gain=gain, local=local_share(math.exp(end.log_odds)))
+def choose_held(held: Sequence[State]) -> State:
+    """Return the likeliest of the ends that hold; the others are evidence against it."""
+    best = max(held, key=lambda state: state.log_odds)
+    others = sum(math.exp(state.log_odds) for state in held if not RIGHT.holds(state.pose, best.pose))
+    return replace(best, log_odds=best.log_odds - math.log1p(others))
 
 
-def compute_gain(problem: Problem, near: Problem, log_alike: float = 0.0) -> float:
-    """Return what a frame gains [log] if it is found among some places: the fewer, the less it is by chance.
+def propose_beside(problem: Problem, workers: Workers) -> list[Pose]:
+    """Return the poses of a photo by its matches with each of the photos beside."""
+    telling = [matches for matches in problem.beside if len(matches.query) > CHANCE_MATCHES]
+    return [one.pose for matches in telling for one in propose_poses(matches, 1, workers)]
 
-    `log_alike` is the log of the number of poses among these that look alike.
-    """
+
+def compute_gain(problem: Problem, near: Problem) -> float:
+    """Return what a frame gains [log] if it is found among few places: the less is that by chance."""
     share = len(near.scan_map.sparse) / len(problem.scan_map.sparse)
-    return min(max(-math.log(share) - log_alike, 0.0), MOST_EXPECTED)
+    return min(-math.log(share), MOST_EXPECTED)
 
 
-def count_alike(problem: Problem, end: Pose, ends: Ends, expected: Expected, workers: Workers) -> float:
-    """Return the log of the effective number of poses within reach that look like that of a narrow photo.
+def join_beside(
+    problem: Problem, own: State, of_others: Sequence[PoseGaussian | None]
+) -> tuple[State, float]:
+    """Return the mean of a frame's pose and of that by the first photo beside whose matches confirm it.
 
-    Beside its own these are the ends of a brief search, hardly worse by whole views.
-    """
-    own = score_near(problem, end, workers)
-    best_score = max(ends.best_score, own)
-    behind = log_behind(problem, own, best_score) - COPY_LOG_ODDS
-    places = list_places(problem, ends, best_score)
-    rivals = [b for pose, b in places if not ONE_ANSWER.holds(pose, end) and expected.is_within(pose)]
-    return float(np.logaddexp.reduce([0.0, *(min(b - behind, 0.0) for b in rivals)]))
-
-
-def join_beside(problem: Problem, own: State, of_others: Sequence[PoseGaussian | None]) -> State:
-    """Return the mean of a frame's pose and of that by the first frame beside whose matches confirm it.
-
-    `of_others` are the poses of the frames beside. Where both agree, the frame's own is no local optimum.
+    Return also the probability that this confirms the pose; 0 without one. Else a narrow photo gains nothing
+    by being found within reach: it may look the same at two poses near each other.
     """
     for matches, gaussian in zip(problem.beside, of_others, strict=True):
         confirmed = confirm(matches, own.pose) if gaussian else None
@@ -97,14 +112,15 @@ def join_beside(problem: Problem, own: State, of_others: Sequence[PoseGaussian |
         expected = attach_by_matches(gaussian, confirmed, matches)
         mean = expected
         if own.gaussian is not None:
-            fused = fuse_allowed(problem, expected, own.gaussian.blur(own.local * LOCAL_ERRORS))
+            local = local_share(math.exp(own.log_odds)) * LOCAL_ERRORS
+            fused = fuse_allowed(problem, expected, own.gaussian.blur(local))
             if fused is None:
                 continue
             mean = fused
         offset = mean.pose.center_world - expected.pose.center_world
-        local = own.local * (1.0 - probability_near(offset, expected.covariance[3:, 3:]))
-        return replace(own, pose=mean.pose, gaussian=mean, local=local)
-    return own
+        share = probability_near(offset, expected.covariance[3:, 3:])
+        return replace(own, pose=mean.pose, gaussian=mean), share
+    return own, 0.0
 
 
 def track(problem: Problem, start: Pose, workers: Workers) -> State | None:

@@ -43,7 +43,6 @@ class State:
     gaussian: PoseGaussian | None = None  # the pose with its covariance, in the map
     end: Candidate | None = None  # where the photo was tracked to; None of one that was searched
     gain: float = 0.0  # [log] of one that was found among the few places within reach
-    local: float = 0.0  # probability that it is a local optimum beside the right pose, if its place is right
 
     @property
     def is_refined(self) -> bool:
@@ -53,7 +52,7 @@ class State:
     @property
     def within(self) -> float:
         """Probability that the pose is within 0.1 m, if its place is right."""
-        return (1.0 - self.local) * probability_within(self.gaussian)
+        return probability_within(self.gaussian)
 
 
 @dataclass

@@ -8,7 +8,8 @@ import numpy as np
 
 from ...geometry.nearness import ONE_ANSWER, ONE_PLACE, non_maximum_suppression
 from ...geometry.pose import Pose, uniform_yaws
-from ...judge.probability import MODELS, Standing, pose_features
+from ...judge.localization import Localization
+from ...judge.probability import LOCALIZED, MODELS, Standing, pose_features
 from ...localization.beam import Ends, descend_briefly, score_briefly, score_mirror, score_near
 from ...localization.means import Means
 from ...problem.problem import Problem
@@ -28,24 +29,36 @@ def fits_mirror(problem: Problem, means: Means) -> bool:
 
 
 def list_key_states(
-    problem: Problem, own: Sequence[State], means: Means, is_sure: bool = False
+    problem: Problem, own: Sequence[State], means: Means, alone: Localization | None = None
 ) -> list[State]:
     """List the states of a key frame: the poses that were found for it, best first, and all other places.
 
-    If the photo is sure by itself, other places get the lowest odds that one frame may give.
+    `alone` is the result of a frame that was searched by itself.
     """
     best = own[0]
-    limit = -MOST_ODDS - COPY_LOG_ODDS if is_sure else 0.0
-    rough = [
-        State(pose, best.log_odds + min(behind, limit))
+    others = [
+        (pose, behind)
         for pose, behind in find_places(problem, best.pose, means)
         if not any(ONE_PLACE.holds(pose, state.pose) for state in own)
-    ]
+    ][:MOST_PLACES]
+    most = math.inf if alone is None else most_elsewhere(problem, alone, best, len(others))
+    rough = [State(pose, min(best.log_odds + behind, most)) for pose, behind in others]
     states: list[State] = []
     for state in (*own, *rough):
         if not any(ONE_ANSWER.holds(state.pose, other.pose) for other in states):
             states.append(state)
     return states[:MOST_PLACES]
+
+
+def most_elsewhere(problem: Problem, alone: Localization, best: State, count: int) -> float:
+    """Return the odds [log] that a place may have at most where a frame that was searched was not found.
+
+    If the photo is sure by itself, they are the lowest that one frame may give. All `count` places together
+    have those of a narrow photo that none of its poses is right: views alone tell little of it.
+    """
+    if alone.status == LOCALIZED:
+        return best.log_odds - MOST_ODDS - COPY_LOG_ODDS
+    return -math.log(max(count, 1)) - COPY_LOG_ODDS if problem.profile.is_partial else math.inf
 
 
 def narrow_down(problem: Problem, pose: Pose, radius: float, effort: Effort) -> tuple[Problem, Effort]:

@@ -27,6 +27,7 @@ from ...judge.localization import Alternative, Localization
 from ...judge.pose_covariance import describe_errors
 from ...judge.probability import LOCALIZED
 from ...judge.reasons import explain
+from ...judge.sure import SURE_ODDS
 from ...problem.problem import Problem
 from .expectation import Expected, Followed
 from .following import find_near, refine_state
@@ -340,12 +341,18 @@ def _list_ways(tracker: Tracker, beliefs: Sequence[Ranked], k: int) -> list[tupl
     if frame.key is not None and belief.expected is not None:
         expected = Expected(belief.expected, tracker.motion.reach(0.0), belief.expected)
         ways = [(frame.key, partial(find_near, expected=expected, means=tracker.means))]
-    is_lost = belief.confidence < tracker.settings.min_confidence and not (frame.is_key and belief.is_sure)
-    if is_lost and (sides := _list_sure(tracker.frames, beliefs, k)):
+    is_unsure = belief.confidence < tracker.settings.min_confidence or not is_confirmed(frame)
+    is_kept = frame.is_key and belief.is_sure
+    if is_unsure and not is_kept and (sides := _list_sure(tracker.frames, beliefs, k)):
         nearest = [side[0] for side in sides] if len(sides) > 1 else sides[0]
         near = [(m, beliefs[m].states[0].pose) for m in nearest]
         ways.append((sides[0][0], partial(tracker.find, frame=frame, near=near)))
     return ways
+
+
+def is_confirmed(frame: Frame) -> bool:
+    """Return True if a frame's pose is sure by itself, or by being found where others expect it."""
+    return any(state.gain > 0.0 or state.log_odds >= SURE_ODDS for state in frame.states[:1])
 
 
 def _list_sure(frames: Sequence[Frame], beliefs: Sequence[Ranked], k: int) -> list[list[int]]:

@@ -22,12 +22,13 @@ from ...problem.settings import CoarseToFineSettings
 from ...scan_map.camera_positions import FreeSpace
 from ...scan_map.scan_map import ScanMap
 from .expectation import Followed, expect
-from .following import find_near, join_beside, refine_state
+from .following import Told, find_near, refine_state
 from .frames import REACH_SLACK, Frame, Motion, list_states, put_state
 from .path import EVEN, Lattice
 from .places import fits_mirror, list_key_states
 
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
+MOST_KNOWN = 2  # chosen: poses of a frame within reach, at which it is looked for again
 NUM_KEPT = 4  # problems, of the frames that were asked for last
 BETWEEN_KEYS = ONE_PLACE.distance  # [m] key frames are so far apart
 ELSEWHERE = ONE_PLACE.distance + 2.0 * REACH_SLACK  # [m] reach beyond which a camera may be at another place
@@ -157,7 +158,7 @@ class Tracker:
 
         A narrow photo is matched with those of them that are sure by themselves.
         """
-        of_others: list[PoseGaussian | None] = []
+        of_others: Sequence[PoseGaussian | None] = ()
         if problem.profile.is_narrow:
             sure = [(k, pose) for k, pose in near if self.frames[k].log_odds >= SURE_ODDS]
             others = [(k, other, pose) for k, pose in sure if (other := self.problem_of(k))]
@@ -166,8 +167,8 @@ class Tracker:
             problem = replace(problem, beside=beside)
             of_others = [self._gaussian_at(k, pose) for k, _, pose in others]
         expected = expect(frame, [(self.frames[k], pose) for k, pose in near], self.motion)
-        found = find_near(problem, expected, self.means)
-        return found and found._replace(state=join_beside(problem, found.state, of_others))
+        known = [state.pose for state in frame.states if expected.is_within(state.pose)]
+        return find_near(problem, expected, self.means, Told(known[:MOST_KNOWN], of_others))
 
     def _gaussian_at(self, k: int, pose: Pose) -> PoseGaussian | None:
         """Return a frame's pose with its covariance, if it is at a pose."""
@@ -209,7 +210,7 @@ class Tracker:
             tracked = [] if is_sure else frame.states
             own = found[:1] if is_sure else sorted([*found, *tracked], key=lambda state: -state.log_odds)
             frame.how = "alone" if own[0] is found[0] else frame.how
-            frame.states = list_key_states(problem, own, self.means, is_sure)
+            frame.states = list_key_states(problem, own, self.means, frame.alone)
             frame.is_key = True
 
     def _depart(self, problem: Problem, frame: Frame) -> None:
