@@ -10,6 +10,7 @@ from refusals import assert_input_error
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, carry, exp_so3, pose_errors, yaw_rotation
+from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.together.walk import path as walk_path, results
 from piccolo.together.walk.frames import JUMP_LOG, MOST_EXPECTED, Frame, Motion, State, check_times
 from piccolo.together.walk.path import NOTHING, Ranked, believe
@@ -296,7 +297,7 @@ def walk():
         return results.find_near(problem, expected, None)
 
     about = {"find": find, "problem_of": lambda k: k, "means": None}
-    tracker = SimpleNamespace(frames=frames, motion=Motion(), **about)
+    tracker = SimpleNamespace(frames=frames, motion=Motion(), settings=CoarseToFineSettings(), **about)
     return tracker, walk_path.Path(probabilities, [None] * len(frames)), beliefs
 
 

@@ -27,8 +27,9 @@ from piccolo.together.walk.expectation import (
     list_starts,
     predict,
 )
-from piccolo.together.walk.frames import Frame, Motion, State
-from piccolo.together.walk.tracker import choose_end, find_near, find_places, narrow_down, refine_state, track
+from piccolo.together.walk.following import choose_end, find_near, refine_state, track
+from piccolo.together.walk.frames import MOST_EXPECTED, Frame, Motion, State
+from piccolo.together.walk.places import find_places, narrow_down
 
 SEED = 1
 EFFORT = rooms.AUTO.effort
@@ -247,7 +248,7 @@ def follower(seen):
     taken = _narrow(problem).given
     asked = []
     follower = tracker.Tracker(problem.scan_map, rooms.AUTO, WORKERS, Motion())
-    odds = (4.0, 4.0, 4.0, tracker.MOST_EXPECTED, 4.0, 2.9)
+    odds = (4.0, 4.0, 4.0, MOST_EXPECTED, 4.0, 2.9)
     follower.lattice.frames.extend(Frame(0.5 * k, [State(seen[1], o)]) for k, o in enumerate(odds))
     follower.read = lambda k: asked.append(k) or taken
     return follower, asked
@@ -258,7 +259,7 @@ def test_a_narrow_photo_is_matched_with_the_frames_it_is_found_from(seen, follow
     problem, true = seen
     near = [(5, _off(true, 0.6, 0.0)), (4, _off(true, 0.5, 0.0)), (3, _off(true, 0.4, 0.0))]
     given = []
-    monkeypatch.setattr(tracker, "find_near", lambda problem, expected, _: given.append((problem, expected)))
+    monkeypatch.setattr(tracker, "find_near", lambda problem, expected, *_: given.append((problem, expected)))
     taken = _narrow(problem)
     for photo in (problem, taken):
         follower[0].find(photo, Frame(3.0), near)

@@ -32,7 +32,7 @@ LEAST_SCORE = 0.05  # of a tracked pose: with less it explains nothing
 
 
 class Told(NamedTuple):
-    """What is known of a narrow photo besides where it is expected."""
+    """Poses that are known where a narrow photo is looked for."""
 
     known: Sequence[Pose] = ()  # at which it was found before
     beside: Sequence[PoseGaussian | None] = ()  # poses of the photos beside, with which it is matched

@@ -27,7 +27,6 @@ from ...judge.localization import Alternative, Localization
 from ...judge.pose_covariance import describe_errors
 from ...judge.probability import LOCALIZED
 from ...judge.reasons import explain
-from ...judge.sure import SURE_ODDS
 from ...problem.problem import Problem
 from .expectation import Expected, Followed
 from .following import find_near, refine_state
@@ -120,7 +119,10 @@ def describe_frame(frames: Sequence[Frame], k: int, gap: Gap | None) -> WalkFram
 def make_localization(tracker: Tracker, frame: Frame, ranked: Ranked) -> Localization:
     """Make a frame's result from its poses and the probabilities that the walk gives them."""
     if not ranked.states:
-        return frame.alone or Localization()
+        found = frame.alone or Localization()
+        is_beyond = found.status == LOCALIZED  # reach of the others: it contradicts them
+        least = tracker.settings.min_confidence
+        return found.take_belief(found.belief.scale(EVEN), least) if is_beyond else found
     best, *others = ranked.states
     others = others[:MAX_ALTERNATIVES]
     scan_map = tracker.scan_map
@@ -228,7 +230,8 @@ def _settle(tracker: Tracker, show: Progress) -> tuple[Path, list[Ranked]]:
 def _search_unsure(tracker: Tracker, beliefs: Sequence[Ranked], show: Progress) -> bool:
     """Search frames by themselves that the walk leaves unsure; return True if that finds any.
 
-    A frame that was found stays as it is, unless the photo is sure by itself.
+    A pose beyond reach of sure frames does not count. A frame that was found stays as it is, unless the photo
+    is sure by itself.
     """
     asked = list_unsure(tracker.frames, beliefs, tracker.settings.min_confidence)
     is_any_found = False
@@ -236,13 +239,14 @@ def _search_unsure(tracker: Tracker, beliefs: Sequence[Ranked], show: Progress) 
         problem = tracker.problem_of(k)
         if problem is None:
             continue
-        searched = replace(tracker.frames[k])
+        frame = tracker.frames[k]
+        searched = replace(frame)
         tracker.search(problem, searched)
-        if searched.is_localized_alone or not tracker.frames[k].states:
+        is_better = searched.is_key and (searched.is_localized_alone or not frame.states)
+        if is_better and _is_walked(tracker, beliefs, k, searched.states[0].pose):
             tracker.frames[k] = searched
-            is_any_found |= searched.is_key
-        else:
-            tracker.frames[k].alone = searched.alone
+            is_any_found = True
+        frame.alone = searched.alone
     return is_any_found
 
 
@@ -341,18 +345,13 @@ def _list_ways(tracker: Tracker, beliefs: Sequence[Ranked], k: int) -> list[tupl
     if frame.key is not None and belief.expected is not None:
         expected = Expected(belief.expected, tracker.motion.reach(0.0), belief.expected)
         ways = [(frame.key, partial(find_near, expected=expected, means=tracker.means))]
-    is_unsure = belief.confidence < tracker.settings.min_confidence or not is_confirmed(frame)
+    is_unsure = belief.confidence < tracker.settings.min_confidence or not belief.is_confirmed
     is_kept = frame.is_key and belief.is_sure
     if is_unsure and not is_kept and (sides := _list_sure(tracker.frames, beliefs, k)):
         nearest = [side[0] for side in sides] if len(sides) > 1 else sides[0]
         near = [(m, beliefs[m].states[0].pose) for m in nearest]
         ways.append((sides[0][0], partial(tracker.find, frame=frame, near=near)))
     return ways
-
-
-def is_confirmed(frame: Frame) -> bool:
-    """Return True if a frame's pose is sure by itself, or by being found where others expect it."""
-    return any(state.gain > 0.0 or state.log_odds >= SURE_ODDS for state in frame.states[:1])
 
 
 def _list_sure(frames: Sequence[Frame], beliefs: Sequence[Ranked], k: int) -> list[list[int]]:
