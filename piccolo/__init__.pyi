@@ -1,4 +1,5 @@
 # The public names: type checkers read them here, and at run time each is imported from here at its first use.
+from .coloring.color_scan import Coloring as Coloring
 from .errors import InputError as InputError
 from .geometry.pose import Pose as Pose
 from .judge.pose_covariance import PoseCovariance as PoseCovariance

@@ -1,40 +1,53 @@
 """The public class `Scan`: photos, bundles of photos and walks are localized in it."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache, partial
 from itertools import repeat
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from .arguments import check_kind, check_one_each
 from .arrays import Bytes, Floats
 from .cloud.settings import CloudSettings
 from .cloud.soa import PackedPoints
+from .coloring.color_scan import (
+    OF_RESULTS,
+    Coloring,
+    check_files,
+    check_suffix,
+    color_if_enough,
+    localize_for_colors,
+)
 from .errors import InputError
 from .evidence.occlusion import occlusion_mask
 from .files.atomic import check_output
+from .files.line_file import Journal
 from .geometry.pose import Gravity, Pose, check_pose
-from .jobs.memory import check_memory
-from .jobs.threads import Stopwatch, Workers
-from .judge.probability import LOCALIZED
-from .judge.result import Result, nothing_found
+from .jobs.threads import Workers
+from .judge.result import Result
 from .judge.result_parts import FocalLength
-from .localization.localize import has_guessed_focal, localize, localize_guessed
-from .localization.means import NO_TRACE, Means, Trace
-from .localization.places import add_places
-from .paper.localize import PaperMap, PaperSettings, localize as localize_by_paper
+from .localization.means import NO_TRACE, Trace
+from .paper.localize import PaperMap
 from .photo import File, Photo, Prior, as_photo
 from .photo_reader import PhotoReader, Settings
-from .photos_together import MEMORY_OF_PHOTO, localize_photos
 from .problem.settings import CoarseToFineSettings
+from .scan_bundle import AskedPosed, localize_posed
+from .scan_group import AskedTogether, localize_photos_together
 from .scan_map.open_map import write_map
 from .scan_map.scan_map import ScanMap, check_within
+from .scan_photo import Asked, localize_photo
 from .scan_walk import Walk
-from .together.bundle import localize_bundle
-from .together.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
+from .second_look import Looking, Place
+from .together.beside import SurePhoto
+from .together.bundle_adjustment import RelativeScale
+from .together.second_looks import MOST_PICTURES, Look, localize_in_order
 from .together.walk.frames import Motion
 from .together.walk.tracker import Tracker
 
+BESIDE = "photos beside others"
 ONLY_DEFAULT = ("refine_focal", "gravity_vector")  # options of photos that the preset paper does not have
 Picture = File | Bytes | Photo  # a path or an array (H, W, 3) is a photo without options
 
@@ -125,45 +138,14 @@ class Scan:
         >>> scan.localize(photo, prior=piccolo.Prior(height=(1.0, 1.5))).status
         'localized'
         """
-        return self.localize_photo(as_photo(photo), self._change(prior, gravity, min_confidence))
+        return self.localize_photo(Asked(as_photo(photo), self._change(prior, gravity, min_confidence)))
 
     def localize_photo(
-        self,
-        photo: Photo,
-        settings: Settings,
-        focal: FocalLength | None = None,
-        trace: Trace = NO_TRACE,
+        self, asked: Asked, focal: FocalLength | None = None, trace: Trace = NO_TRACE
     ) -> Result:
-        """Localize a photo by settings of the scan's method, as all that ask for one photo do.
-
-        `focal` is its focal length as found with those of others, which counts then. `trace` notes the steps
-        of the default method.
-        """
-        watch = Stopwatch()
-        self.check_options(photo, settings)
-        reader = self.reader
-        picture, facts = reader.take(photo, watch, focal)
-        gps = None
-        if isinstance(self.prepared, PaperMap):
-            assert isinstance(settings, PaperSettings)
-            found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
-        else:
-            assert isinstance(settings, CoarseToFineSettings)
-            gps = reader.make_gps_prior(facts, settings.prior)
-            run = localize_guessed if has_guessed_focal(picture) else localize
-            means = Means(settings.effort, self.workers, watch, trace)
-            found = nothing_found()
-            if gps is not None:
-                near = replace(settings, prior=gps.apply_to(settings.prior))
-                found = run(self.prepared, picture, near, means)
-            if found.status != LOCALIZED:
-                gps = gps and replace(gps, is_used=False)
-                found = run(self.prepared, picture, settings, means)
-            found = add_places(self.prepared, found)
-        if focal is not None:
-            found = replace(found, focal_length=focal.update(found.focal_length))
-        blank = reader.make_blank(photo, picture, facts, settings, watch.seconds)
-        return replace(found.complete(blank), gps_prior=gps)
+        """Localize a photo by settings of the scan's method, as all who ask for one do (`localize_photo`)."""
+        self.check_options(*asked)
+        return localize_photo(self.prepared, self.reader, self.workers, asked, focal, trace)
 
     def localize_many(
         self,
@@ -175,27 +157,69 @@ class Scan:
     ) -> Iterator[Result]:
         """Return an iterator over the results of photos, in order; each is computed when it is asked for.
 
+        Photos in a sequence, as a list, help each other, as those of one command line: one of a part of the
+        sphere gets a second look, with the focal length that others of its camera have, or beside others that
+        are sure. Results from the first that may still change wait for that. Photos of any other iterable
+        are each localized alone.
+
         `prior` is one of all photos, or a list with one of each. The status of a photo that can't be read is
         "unreadable", or "failed" if another try may succeed; `error` says why.
         """
         check_kind("photos", photos, Iterable[Picture])
         check_kind("prior", prior, Prior | Sequence[Prior | None] | None)
+        may_help = isinstance(photos, Sequence) and isinstance(self.prepared, ScanMap)
         priors: Iterable[Prior | None] = repeat(prior) if prior is None or isinstance(prior, Prior) else prior
         if isinstance(prior, Sequence):
             photos = list(photos)
             check_one_each("prior", prior, len(photos), "photo")
-        self._change(None, gravity, min_confidence)  # refused before the first photo is asked for
+        settings = self._change(None, gravity, min_confidence)  # refused before the first photo is asked for
+        own = (
+            Asked(as_photo(photo), self._change(prior, gravity, min_confidence))
+            for photo, prior in zip(photos, priors, strict=False)
+        )
+        if not may_help:
+            return map(self.try_photo, own)
+        return self.localize_in_order(list(own), settings.min_confidence)
 
-        def localize(picture: Picture, prior: Prior | None) -> Result:
-            photo = as_photo(picture)
-            settings = self._change(prior, gravity, min_confidence)
-            self.check_options(photo, settings)
-            try:
-                return self.localize_photo(photo, settings)
-            except Exception as error:
-                return self.reader.make_failed(photo, error, settings)
+    def localize_in_order(self, asked: Sequence[Asked], min_confidence: float) -> Iterator[Result]:
+        """Localize photos that help each other; yield results in order, each when it is final."""
+        known: dict[tuple[str, str | None], Asked] = {}  # by name and digest
 
-        return map(localize, photos, priors)
+        @lru_cache(MOST_PICTURES)
+        def place(result: Result) -> SurePhoto | None:
+            return self.place_keypoints(known[result.pano, result.source.pano_sha256], result)
+
+        def localize(one: Asked) -> Result:
+            result = self.try_photo(one)
+            known[result.pano, result.source.pano_sha256] = one
+            return result
+
+        def look_again(one: Asked, look: Look) -> Result:
+            return self.try_photo(one, partial(self.look_again, look=look, place=place))
+
+        return localize_in_order(asked, localize, look_again, min_confidence)
+
+    def try_photo(self, asked: Asked, localize: Callable[[Asked], Result] | None = None) -> Result:
+        """Localize a photo, by default alone; of one that can't be read return why.
+
+        Raises InputError for an option that this scan does not have.
+        """
+        self.check_options(*asked)
+        try:
+            return localize(asked) if localize else self.localize_photo(asked)
+        except Exception as error:
+            return self.reader.make_failed(asked.photo, error, asked.settings)
+
+    def look_again(self, asked: Asked, look: Look, place: Place) -> Result:
+        """Localize a photo again: with the focal length that others tell, or beside others."""
+        scan_map, settings = self.require_default_method(BESIDE, asked.settings)
+        first = look.first or self.localize_photo(asked, look.focal)
+        return Looking(scan_map, self.reader, self.workers).look(asked.photo, first, look, place, settings)
+
+    def place_keypoints(self, asked: Asked, result: Result) -> SurePhoto | None:
+        """Return the keypoints of a photo that is localized; None if it is another, or none, by now."""
+        scan_map, settings = self.require_default_method(BESIDE, asked.settings)
+        return Looking(scan_map, self.reader, self.workers).place(asked.photo, result, settings)
 
     def localize_bundle(
         self,
@@ -222,26 +246,45 @@ class Scan:
         scan_map, settings = self.require_default_method("`relative_poses`", settings)
         for photo in given:
             self.check_options(photo, settings)
-        poses = [check_pose(pose, "`relative_poses`") for pose in relative_poses]
-        if not given:
-            return []
-        watch = Stopwatch()
-        needed = len(given) * MEMORY_OF_PHOTO
-        check_memory(needed, f"{len(given)} photos together", "localize fewer together")
-        reader = self.reader
-        taken = [reader.take(photo, watch) for photo in given]
-        pictures = [picture for picture, _ in taken]
-        if any(map(has_guessed_focal, pictures)):
-            raise InputError("`relative_poses`: found a focal length that is a guess, wanted a known one")
-        errors = RelativeErrors()
-        if relative_scale == "unknown":
-            errors = errors._replace(log_scale=UNKNOWN_SCALE)
-        found = localize_bundle(scan_map, pictures, poses, settings, self.workers, watch, errors)
-        seconds = {stage: spent / len(found) for stage, spent in watch.seconds.items()}
-        return [
-            add_places(scan_map, one).complete(reader.make_blank(photo, picture, facts, settings, seconds))
-            for photo, (picture, facts), one in zip(given, taken, found, strict=True)
+        asked = [
+            AskedPosed(photo, check_pose(pose, "`relative_poses`"), settings)
+            for photo, pose in zip(given, relative_poses, strict=True)
         ]
+        return localize_posed(scan_map, self.reader, self.workers, asked, relative_scale)
+
+    def color(
+        self,
+        photos: Iterable[Picture],
+        out: File,
+        *,
+        prior: Prior | None = None,
+        gravity: Gravity | None = None,
+        min_confidence: float | None = None,
+    ) -> Coloring:
+        """Localize photos, again in each other's colours, and write the scan in their colours to `out`.
+
+        Its suffix is .ply, .las, .laz or .e57. Raises InputError for a scan that is not of files.
+        """
+        check_kind("photos", photos, Iterable[Picture])
+        check_kind("out", out, File)
+        settings = self._change(prior, gravity, min_confidence)
+        scan_map, settings = self.require_default_method("color", settings)
+        asked = [Asked(as_photo(photo), settings) for photo in photos]
+        path = Path(out)
+        files = [Path(name) for name in ([self.name] if isinstance(self.name, str) else self.name)]
+        check_files(files)
+        check_suffix(path)
+        check_output(path)
+        if any(isinstance(one.photo.picture, np.ndarray) for one in asked):
+            raise InputError("`photos`: found an array, wanted files, which are read again for their colours")
+
+        def localize(shown: ScanMap, k: int) -> Result:
+            result = replace(self, prepared=shown).try_photo(asked[k])
+            return replace(result, settings={**result.settings, **OF_RESULTS})
+
+        steps = [one.photo.name for one in asked]
+        results = localize_for_colors(scan_map, steps, localize, len(asked), self.workers, Journal())
+        return color_if_enough(files, scan_map, self.cloud_settings, results, path, self.workers)
 
     def localize_together(
         self,
@@ -263,7 +306,8 @@ class Scan:
         scan_map, settings = self.require_default_method("photos together", settings)
         for photo in given:
             self.check_options(photo, settings)
-        return localize_photos(self.reader, scan_map, given, settings, self.workers)
+        asked = [AskedTogether(photo, settings) for photo in given]
+        return localize_photos_together(scan_map, self.reader, self.workers, asked)
 
     def track(
         self,

@@ -32,8 +32,12 @@ class Client:
 
     def post(self, path, name, content, options=None, **headers):
         """The same of a picture that is sent as a form."""
+        return self.post_all(path, {name: content}, options, **headers)
+
+    def post_all(self, path, pictures, options=None, **headers):
+        """The same of several pictures, by their names."""
         mark = uuid.uuid4().hex
-        parts = [("picture", f'; filename="{name}"', content)]
+        parts = [("picture", f'; filename="{name}"', content) for name, content in pictures.items()]
         if options is not None:
             text = options if isinstance(options, str) else json.dumps(options)
             parts.append(("options", "", text.encode()))

@@ -229,14 +229,14 @@ class Short(module.Localizer):
 
     def open_scan(self, workers):
         scan = super().open_scan(workers)
-        ask = type(scan).localize
+        ask = type(scan).localize_photo
 
-        def localize(self, photo, *more, **noted):
-            if error := Short.errors.pop(photo.path.name, None):
+        def localize(self, asked, *more, **noted):
+            if error := Short.errors.pop(asked.photo.path.name, None):
                 raise error
-            return ask(self, photo, *more, **noted)
+            return ask(self, asked, *more, **noted)
 
-        return type("Scan", (type(scan),), {"localize": localize})(**vars(scan))
+        return type("Scan", (type(scan),), {"localize_photo": localize})(**vars(scan))
 
 
 def test_what_the_system_did_to_a_photo_is_tried_again(scene, out, counted, monkeypatch, capsys):

@@ -20,8 +20,7 @@ from poses import judged
 from test_localize_cameras import SEED, place
 
 from piccolo import open_scan, second_look
-from piccolo.batch import localizer as localizer_module
-from piccolo.batch.localizer import MOST_PICTURES, Localizer, Look, list_looks_beside
+from piccolo.batch.localizer import Localizer
 from piccolo.batch.results_file import StreamOutput
 from piccolo.camera import Mount
 from piccolo.camera.calibration import document_of
@@ -38,6 +37,8 @@ from piccolo.judge.result_parts import Beside, Source
 from piccolo.photo import Photo
 from piccolo.result_files import read_results
 from piccolo.scan import Scan
+from piccolo.second_look import Looking
+from piccolo.together.second_looks import MOST_PICTURES, Look, list_looks_beside
 from research.synthetic.world import render_picture
 
 PHONE = (Mount(pinhole(1024, 512, 400.0)),)
@@ -45,12 +46,12 @@ NONE_ASKED = Beside((), "0" * 64)
 NOWHERE = Pose(np.eye(3), np.zeros(3))
 
 
-def _text(pano, status="localized", beside=None, cameras=PHONE, confidence=0.95):
+def _result(pano, status="localized", beside=None, cameras=PHONE, confidence=0.95):
     source = Source(None, "1" * 64, (1024, 512))
     about = {"beside": beside, "cameras": cameras, "source": source}
     if status in ("unreadable", "failed"):
-        return Result(status, 0.0, "a.ply", pano, error="it is broken", source=source).to_json()
-    return Result(status, confidence, "a.ply", pano, NOWHERE, **about).to_json()
+        return Result(status, 0.0, "a.ply", pano, error="it is broken", source=source)
+    return Result(status, confidence, "a.ply", pano, NOWHERE, **about)
 
 
 def test_a_doubtful_photo_is_sure_beside_another(tmp_path):
@@ -77,7 +78,7 @@ def test_a_doubtful_photo_is_sure_beside_another(tmp_path):
     assert before.confidence < narrow.confidence <= wide.confidence
     assert narrow.pose.distance(near) < 0.05
     localizer = Localizer((Path("room"),), rooms.AUTO, CloudSettings(), Photo("", camera=cameras), None)
-    look = Look(0, before.status, narrow.pano, before.to_json(), (narrow.to_json(),), "1")
+    look = Look(0, narrow.pano, before, (narrow,), "1")
     task = localizer.task(photos / "narrow.png")
     again = localizer.answer_in(rooms.scan(SEED))(task._replace(look=look))
     assert again.result == replace(before, beside=Beside((), "1"))
@@ -86,33 +87,36 @@ def test_a_doubtful_photo_is_sure_beside_another(tmp_path):
 def test_doubtful_phone_photos_are_looked_at_beside_sure_ones():
     """What was localized beside others is no picture for others; spheres are not looked at again."""
     statuses = ("localized", "ambiguous", "not_localized", "unreadable", "failed")
-    texts = [_text(f"{k}", status) for k, status in enumerate(statuses)]
-    texts += [_text("5", beside=Beside(("0",), "0" * 64)), _text("6", cameras=())]
-    texts += [_text("7", "ambiguous", cameras=()), _text("8", "not_localized", NONE_ASKED)]
-    texts += [_text("9", confidence=0.94)]
-    looks = list_looks_beside(texts)
-    assert [(look.number, look.status, look.pano, look.first) for look in looks] == [
-        (1, "ambiguous", "1", texts[1]),
-        (2, "not_localized", "2", texts[2]),
-        (5, "localized", "5", ""),
-        (8, "not_localized", "8", texts[8]),
+    results = [_result(f"{k}", status) for k, status in enumerate(statuses)]
+    results += [_result("5", beside=Beside(("0",), "0" * 64)), _result("6", cameras=())]
+    results += [_result("7", "ambiguous", cameras=()), _result("8", "not_localized", NONE_ASKED)]
+    results += [_result("9", confidence=0.94)]
+    looks = list_looks_beside(results)
+    assert [(look.number, look.pano, look.first) for look in looks] == [
+        (1, "1", results[1]),
+        (2, "2", results[2]),
+        (5, "5", None),
+        (8, "8", results[8]),
     ]
-    assert all(look.beside == (texts[0], texts[6]) for look in looks)
-    texts[1] = _text("1", "ambiguous", Beside((), looks[0].asked_sha256))
-    assert [look.number for look in list_looks_beside(texts)] == [2, 5, 8]
-    texts[6] = _text("6", "ambiguous")
-    assert [look.number for look in list_looks_beside(texts)] == [1, 2, 5, 6, 8]
-    assert [(look.number, look.beside) for look in list_looks_beside(texts[1:6])] == [(0, ()), (4, ())]
+    assert all(look.beside == (results[0], results[6]) for look in looks)
+    results[1] = _result("1", "ambiguous", Beside((), looks[0].asked_sha256))
+    assert [look.number for look in list_looks_beside(results)] == [2, 5, 8]
+    results[6] = _result("6", "ambiguous")
+    assert [look.number for look in list_looks_beside(results)] == [1, 2, 5, 6, 8]
+    assert [(look.number, look.beside) for look in list_looks_beside(results[1:6])] == [(0, ()), (4, ())]
 
 
 def test_a_photo_is_looked_at_beside_the_nearest_in_order():
-    texts = [_text(f"{k}", "ambiguous" if k == 40 else "localized") for k in range(MOST_PICTURES + 30)]
-    (look,) = list_looks_beside(texts)
-    assert look.beside == tuple(text for k, text in enumerate(texts) if k != 40 and k <= MOST_PICTURES)
+    results = [_result(f"{k}", "ambiguous" if k == 40 else "localized") for k in range(MOST_PICTURES + 30)]
+    (look,) = list_looks_beside(results)
+    assert look.beside == tuple(one for k, one in enumerate(results) if k != 40 and k <= MOST_PICTURES)
 
 
 def test_lines_on_a_stream_keep_their_order_and_wait_for_one_that_may_change():
-    texts = [_text(f"{k}", status) for k, status in enumerate(("localized", "ambiguous", "localized"))]
+    texts = [
+        _result(f"{k}", status).to_json() for k, status in enumerate(("localized", "ambiguous", "localized"))
+    ]
+    surer = _result("surer").to_json()
     for may_change, before in ((True, texts[:1]), (False, texts)):
         written = []
         output = StreamOutput(written.append, may_change)
@@ -120,10 +124,10 @@ def test_lines_on_a_stream_keep_their_order_and_wait_for_one_that_may_change():
             output.write(text)
         assert written == before
         if may_change:
-            output.replace(1, "surer")
-            assert output.texts() == [texts[0], "surer", texts[2]]
+            output.replace(1, surer)
+            assert [one.pano for one in output.results()] == ["0", "surer", "2"]
         output.close()
-        assert written == ([texts[0], "surer", texts[2]] if may_change else texts)
+        assert written == ([texts[0], surer, texts[2]] if may_change else texts)
 
 
 @pytest.fixture
@@ -155,10 +159,11 @@ def looked(monkeypatch):
     """What is looked at again; b and d are not sure before, and d is not after."""
     ask, known, looked = Scan.localize_photo, {}, Looked([], {})
 
-    def localize(self, photo, *more, **noted):
+    def localize(self, asked, *more, **noted):
+        photo = asked.photo
         content = photo.path.read_bytes()
         if content not in known:
-            known[content] = ask(self, photo, *more, **noted)
+            known[content] = ask(self, asked, *more, **noted)
         found = replace(known[content], pano=photo.name)
         is_sure = photo.path.name not in ("b.jpg", "d.jpg")
         status = found.status if is_sure else "ambiguous"
@@ -166,13 +171,13 @@ def looked(monkeypatch):
         looked.firsts[photo.path.name] = found.to_json()
         return found
 
-    def localize_again(_map, _reader, _workers, photo, first, list_pictures, *_):
+    def localize_again(_self, photo, first, list_pictures, *_):
         names = tuple(list_pictures())
         looked.asked.append((photo.path.name, [Path(name).name for name in names]))
         return (first, ()) if photo.path.name == "d.jpg" else (replace(first, status="localized"), names[:1])
 
     monkeypatch.setattr(Scan, "localize_photo", localize)
-    monkeypatch.setattr(localizer_module, "localize_again", localize_again)
+    monkeypatch.setattr(Looking, "localize_again", localize_again)
     monkeypatch.setattr(Localizer, "place_keypoints", lambda self, scan, line: line)
     return looked
 
@@ -291,7 +296,7 @@ def test_a_look_that_fails_is_told_and_leaves_the_result(
     def localize_again(*_):
         raise OSError(errno.EIO, "Input/output error", "disk")
 
-    monkeypatch.setattr(localizer_module, "localize_again", localize_again)
+    monkeypatch.setattr(Looking, "localize_again", localize_again)
     assert _run(scene, photos, "--out", out, "--quiet") == 1
     assert "disk: cannot be used (Input/output error)" in capsys.readouterr().err
     assert _lines(out.read_text())[1] == ("b.jpg", "ambiguous", None)
@@ -299,7 +304,7 @@ def test_a_look_that_fails_is_told_and_leaves_the_result(
     def stop(*_):
         raise RuntimeError
 
-    monkeypatch.setattr(localizer_module, "localize_again", stop)
+    monkeypatch.setattr(Looking, "localize_again", stop)
     assert _run(scene, photos, "--quiet") == 4
     assert len(_lines(capsys.readouterr().out)) == 3, "lines that waited are not lost"
 
@@ -319,8 +324,8 @@ def test_what_is_looked_at(scene, monkeypatch):
     monkeypatch.setattr(second_look, "localize_beside", localize_beside)
 
     def look(before, pictures):
-        place = scan.prepared, scan.reader, scan.workers
-        return second_look.localize_again(*place, Photo(photo), before, lambda: pictures, scan.settings)
+        looking = Looking(scan.prepared, scan.reader, scan.workers)
+        return looking.localize_again(Photo(photo), before, lambda: pictures, scan.settings)
 
     found, names = look(first, {"x": None})
     assert (found.status, found.confidence, names) == ("localized", 0.93, ("x",))
@@ -340,27 +345,29 @@ def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypat
     scan = open_scan(scene / "cloud.ply", cache=False)
     photo = tmp_path / "a.jpg"
     photo.write_bytes((scene / "images" / "clean_0.jpg").read_bytes())
-    text = scan.localize(str(photo)).to_json()
+    sure = scan.localize(str(photo))
     settings = scan.settings, scan.cloud_settings
     localizer = Localizer((scene / "cloud.ply",), *settings, Photo(""), None)
-    located, confidence, gaussian = localizer.place_keypoints(scan, text)
-    assert confidence == json.loads(text)["confidence"]
+    located, confidence, gaussian = localizer.place_keypoints(scan, sure)
+    assert confidence == sure.confidence
     in_world = describe_errors(gaussian, scan.prepared.R_map_from_world.T).matrix
-    np.testing.assert_allclose(in_world, json.loads(text)["covariance"], atol=1e-9)
-    assert located.pose.key == scan.prepared.from_world(Result.from_json(text).best_pose).key
+    np.testing.assert_allclose(in_world, sure.covariance.matrix, atol=1e-9)
+    assert located.pose.key == scan.from_world(sure.best_pose).key
     assert len(located.ranges) == len(located.keypoints.rays) > 50
     assert (located.ranges > 0.0).all()
     asked = []
+    others = [replace(sure, pano=name) for name in "bcd"]
     with monkeypatch.context() as patch:
-        patch.setattr(Localizer, "place_keypoints", lambda self, scan, line: asked.append(line))
-        patch.setattr(localizer_module, "localize_again", lambda *given: (given[4], (*given[5](),)))
+        patch.setattr(Localizer, "place_keypoints", lambda self, scan, one: asked.append(one.pano))
+        patch.setattr(Looking, "localize_again", lambda self, path, first, found, *_: (first, (*found(),)))
         answer = localizer.answer_in(scan)
-        for beside in ((text, " " + text), (" " + text, "  " + text)):
-            answer(localizer.task(photo)._replace(look=Look(0, "ambiguous", str(photo), text, beside, "1")))
-    assert [line.count(" {") - text.count(" {") for line in asked] == [0, 1, 1]
+        for beside in (others[:2], others[1:]):
+            look = Look(0, str(photo), sure, tuple(beside), "1")
+            answer(localizer.task(photo)._replace(look=look))
+    assert asked == ["b", "c", "d"]
     photo.write_bytes((scene / "images" / "clean_1.jpg").read_bytes())
-    assert localizer.place_keypoints(scan, text) is None
+    assert localizer.place_keypoints(scan, sure) is None
     photo.unlink()
-    assert localizer.place_keypoints(scan, text) is None
+    assert localizer.place_keypoints(scan, sure) is None
     with pytest.raises(InputError, match="photos beside others: not available with the preset paper"):
         scan.require_default_method("photos beside others", None)

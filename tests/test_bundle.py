@@ -26,6 +26,7 @@ from piccolo.together.bundle import (
     CONTRADICTS_OTHERS,
     NOT_FOUND,
     UNSEEN,
+    Posed,
     compare_errors,
     judge_member,
     localize_bundle,
@@ -228,8 +229,8 @@ def _relative(poses, far=0.0):
 
 def _together(photos, poses, num_threads=2):
     """Results in room SEED of photos with relative poses."""
-    how = rooms.KNOWN, Workers(num_threads), Stopwatch(), ERRORS
-    return localize_bundle(rooms.scan_map(SEED), photos, poses, *how)
+    posed = [Posed(photo, pose, rooms.KNOWN) for photo, pose in zip(photos, poses, strict=True)]
+    return localize_bundle(rooms.scan_map(SEED), posed, Workers(num_threads), Stopwatch(), ERRORS)
 
 
 @functools.lru_cache

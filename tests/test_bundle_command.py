@@ -66,6 +66,28 @@ def test_results_are_written_in_order(scene, relative, tmp_path, capsys):
     assert [r.pose.key for r in read_results([out])] == [r.pose.key for r in results]
 
 
+def test_pictures_priors_and_steps_of_photos_together(scene, relative, tmp_path):
+    """As of photos that come one by one."""
+    truth = read_scene(scene).by_name[NAMES[0]].pose.center_world
+    priors = tmp_path / "priors.csv"
+    priors.write_text(f"name,x,y,radius\n{NAMES[0]},{truth[0]},{truth[1]},1.5\n")
+    out = tmp_path / "poses.jsonl"
+    trace = tmp_path / "trace.jsonl"
+    folders = [tmp_path / "overlays", tmp_path / "masks"]
+    for folder in folders:
+        folder.mkdir()
+    words = ["--overlay", folders[0], "--occlusion-mask", folders[1], "--priors", priors, "--trace", trace]
+    assert main(_command(scene, relative, "--out", out, *words)) == 0
+    results = read_results([out])
+    _assert_right(scene, results)
+    assert [r.settings["prior"]["radius"] for r in results] == [1.5, None, None]
+    for folder in folders:
+        assert sorted(path.stem for path in folder.iterdir()) == ["clean_0", "clean_1", "clean_2"]
+    steps = [json.loads(line) for line in trace.read_text().splitlines()]
+    assert {step["pano"].rpartition("/")[2] for step in steps} == set(NAMES)
+    assert {step["step"] for step in steps} >= {"attempt", "refined", "judged"}
+
+
 def test_results_go_to_stdout_and_the_code_says_that_some_are_not_localized(scene, relative, capsys):
     """Nothing is sure enough."""
     assert main(_command(scene, relative, "--min-confidence", 1.0 - 1e-15)) == 1
@@ -80,10 +102,7 @@ def test_results_go_to_stdout_and_the_code_says_that_some_are_not_localized(scen
     ("options", "code", "text"),
     [
         (["--walk"], 2, "--walk: not with --relative"),
-        (["--jobs", "2"], 2, "--jobs: not with --relative"),
-        (["--overlay", "."], 2, "--overlay: not with --relative"),
-        (["--occlusion-mask", "."], 2, "--occlusion-mask: not with --relative"),
-        (["--priors", "a.csv"], 2, "--priors: not with --relative"),
+        (["--jobs", "2"], 2, "--jobs: not with --relative: its photos are weighed as one camera"),
         (["--refine-focal"], 2, "--refine-focal: not with --relative"),
         (["--preset", "paper"], 2, "--relative: not an option of the preset paper"),
         (["--relative", "none.json"], 3, "none.json: cannot be"),

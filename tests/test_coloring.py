@@ -13,8 +13,8 @@ from batches import untimed
 from scans import read_cloud
 from scipy.spatial import cKDTree
 
+from piccolo.batch.jobs import steps_file
 from piccolo.cli import color_scan as tool, localize as command_line
-from piccolo.cli.together import steps_file
 from piccolo.cloud.octree import build_octree, recolor
 from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.writers import vertex_rows, write_colored, writing_e57
@@ -217,7 +217,7 @@ def test_a_stranger_is_not_localized_by_its_own_paint(tmp_path, monkeypatch):
         panorama = rooms.as_panorama(photos[k][0])
         found = rooms.locate(panorama, painted, settings)
         about = {name: getattr(found, name) for name in ("status", "confidence", "covariance")}
-        return replace(by_shape[k], best_pose=found.pose, **about)
+        return replace(by_shape[k], best_pose=found.best_pose, **about)
 
     results = localize_by_colors(scan_map, by_shape, localize_one, Workers(2), Journal())
     assert [result.status for result in results] == ["localized"] * 2 + ["not_localized"]

@@ -1,6 +1,5 @@
 """What the photos of one camera say of its focal length together, and what a batch makes of it."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -12,7 +11,6 @@ from poses import judged
 from test_focal_length import DENSE, TRUE
 from test_localize_cameras import SEED, place
 
-from piccolo.batch.localizer import list_changed_by_consensus, list_looks_by_focal
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli.localize import main
@@ -25,12 +23,13 @@ from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result
 from piccolo.judge.result_parts import FocalLength, Source
 from piccolo.result_files import read_results
+from piccolo.together.second_looks import follow_cameras, list_looks_by_focal
 from research.synthetic.world import render_picture
 
 GIVEN = 700.0
 
 
-def _text(picture, std, given_std=0.003, status="localized", confidence=0.95, **more):
+def _result(picture, std, given_std=0.003, status="localized", confidence=0.95, **more):
     """A photo's line; the picture's focal length over that given, and the deviations of both."""
     pose = Pose(np.eye(3), np.zeros(3))
     told = {"picture_px": GIVEN * picture, "picture_std_px": GIVEN * picture * std} if picture else {}
@@ -42,7 +41,7 @@ def _text(picture, std, given_std=0.003, status="localized", confidence=0.95, **
     result = Result(status, confidence, "a.ply", "a.jpg", pose, cameras=camera, source=source)
     place = confidence / (1.0 - focal.doubt)
     found = {"probability_none": 1.0 - confidence, "belief": make_belief([place], doubt=focal.doubt)}
-    return replace(result, focal_length=focal, **found).to_json()
+    return replace(result, focal_length=focal, **found)
 
 
 def test_a_given_focal_length_is_doubted_by_as_much_as_the_picture_can_tell():
@@ -76,25 +75,28 @@ def test_photos_of_one_camera_agree_on_its_focal_length_whatever_some_say():
 
 def test_photos_that_contradict_a_calibration_together_rule_out_all_of_its_poses():
     """None of them contradicts it alone, and one says nothing; it is said once, however often it is asked."""
-    texts = [_text(1.05, 0.02) for _ in range(6)] + [_text(None, 1.0)]
-    changed = list_changed_by_consensus(texts, 0.9)
-    assert [(number, status) for number, status, _ in changed] == [(k, "localized") for k in range(7)]
-    for _, _, result in changed:
+    results = [_result(1.05, 0.02) for _ in range(6)] + [_result(None, 1.0)]
+    changed = list(follow_cameras(results, 0.9))
+    assert [(change.number, change.before.status) for change in changed] == [
+        (k, "localized") for k in range(7)
+    ]
+    assert all(change.is_news for change in changed)
+    assert [change.after for change in changed] == results
+    for result in results:
         assert (result.status, result.confidence) == ("not_localized", 0.0)
         assert result.belief.ruled_out == {Reason.CAMERA}
         (warning,) = result.warnings
         assert warning == "the pictures of this camera have a focal length of 735 px, not 700: check `camera`"
-    again = [result.to_json() for *_, result in changed]
-    assert list_changed_by_consensus(again, 0.9) == []
+    assert list(follow_cameras(results, 0.9)) == []
 
 
 def test_photos_that_confirm_a_calibration_make_all_of_its_poses_surer():
-    texts = [_text(1.0, 0.005, status="ambiguous", confidence=0.89) for _ in range(6)]
-    changed = list_changed_by_consensus(texts, 0.9)
-    assert [result.status for *_, result in changed] == ["localized"] * 6
-    assert all(0.9 < result.confidence < 0.91 for *_, result in changed)
-    assert all(result.belief.doubt == result.focal_length.doubt < 0.01 for *_, result in changed)
-    assert list_changed_by_consensus([result.to_json() for *_, result in changed], 0.9) == []
+    results = [_result(1.0, 0.005, status="ambiguous", confidence=0.89) for _ in range(6)]
+    assert len(list(follow_cameras(results, 0.9))) == 6
+    assert [result.status for result in results] == ["localized"] * 6
+    assert all(0.9 < result.confidence < 0.91 for result in results)
+    assert all(result.belief.doubt == result.focal_length.doubt < 0.01 for result in results)
+    assert list(follow_cameras(results, 0.9)) == []
 
 
 def _judged(belief, **focal):
@@ -121,27 +123,27 @@ def test_a_consensus_changes_the_doubt_alone_and_rules_out():
 
 def test_other_cameras_have_their_own_say():
     """Those of another size or focal length, and guesses, are no photos of this camera."""
-    texts = [_text(1.05, 0.02) for _ in range(2)]
-    other = json.loads(texts[0])
-    texts += [json.dumps(other | {"image_size": [768, 1024]})]
-    longer = {name: 1.1 * other["focal_length"][name] for name in ("px", "given_px", "picture_px")}
-    texts += [json.dumps(other | {"focal_length": other["focal_length"] | longer})]
-    texts += [_text(1.05, 0.02, given_std=0.2)] * 3
-    assert list_changed_by_consensus(texts, 0.9) == []
-    assert list_looks_by_focal(texts) == []
+    results = [_result(1.05, 0.02) for _ in range(2)]
+    other = results[0]
+    results += [replace(other, source=replace(other.source, image_size=(768, 1024)))]
+    longer = {name: 1.1 * getattr(other.focal_length, name) for name in ("px", "given_px", "picture_px")}
+    results += [replace(other, focal_length=replace(other.focal_length, **longer))]
+    results += [_result(1.05, 0.02, given_std=0.2)] * 3
+    assert list(follow_cameras(results, 0.9)) == []
+    assert list_looks_by_focal(results) == []
 
 
 def test_a_photo_is_looked_at_again_with_the_focal_length_of_the_others():
     """One that is sure and agrees is not; nor one for the second time."""
     by_exif = {"given_std": 0.015, "source": "EXIF"}
-    sure = [_text(1.03, 0.004, **by_exif) for _ in range(4)]
-    weak = _text(1.2, 0.2, status="not_localized", confidence=0.2, **by_exif)
+    sure = [_result(1.03, 0.004, **by_exif) for _ in range(4)]
+    weak = _result(1.2, 0.2, status="not_localized", confidence=0.2, **by_exif)
     (look,) = list_looks_by_focal([*sure, weak])
-    assert (look.number, look.first, look.beside) == (4, "", ())
+    assert (look.number, look.first, look.beside) == (4, None, ())
     assert look.focal.others_px == pytest.approx(1.03 * GIVEN, rel=1e-3)
     assert 0.002 < look.focal.others_std_px / look.focal.others_px < 0.006
     assert look.focal.picture_px == pytest.approx(1.2 * GIVEN)
-    done = replace(Result.from_json(weak), focal_length=look.focal).to_json()
+    done = replace(weak, focal_length=look.focal)
     assert list_looks_by_focal([*sure, done]) == []
 
 

@@ -14,6 +14,7 @@ from piccolo.local_features.keypoints import Keypoints
 from piccolo.panorama import Panorama
 from piccolo.together.group import localize_group
 from piccolo.together.links import FIRM, WEAK, Links, Placed, compute_shared, find_links, list_pairs, spread
+from piccolo.together.members import Shot
 
 SEED = 5
 TURN = (6.75, 7.0, 7.25)  # eighths, of photos of 75 degrees that overlap: none is sure alone
@@ -111,7 +112,8 @@ def test_a_mirrored_photo_is_linked_with_none():
 
 
 def _together(photos, num_threads=2):
-    return localize_group(rooms.scan_map(SEED), photos, rooms.KNOWN, Workers(num_threads), Stopwatch())
+    shots = [Shot(photo, rooms.KNOWN) for photo in photos]
+    return localize_group(rooms.scan_map(SEED), shots, Workers(num_threads), Stopwatch())
 
 
 @functools.lru_cache

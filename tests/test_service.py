@@ -93,6 +93,23 @@ def test_the_page_gets_a_photo_in_two_lines(service, photo, expected):
     assert second["pictures"]["scan"]
 
 
+def test_several_photos_get_a_line_each(service, photo, expected):
+    """One of them can't be read, which costs the others nothing."""
+    pictures = {"a.jpg": photo, "b.jpg": b"no picture", "c.jpg": photo}
+    status, headers, body = service.post_all("/localize", pictures)
+    assert (status, headers["content-type"]) == (200, "application/x-ndjson")
+    first, broken, last = map(json.loads, body.decode().splitlines())
+    assert [one["pano"] for one in (first, broken, last)] == list(pictures)
+    assert _same(first, expected)
+    assert _same(last, expected)
+    assert broken["status"] == "unreadable"
+    assert "/tmp" not in broken["error"]
+    status, _, body = service.post_all("/show", pictures)
+    lines = list(map(json.loads, body.decode().splitlines()))
+    assert [line["photo"]["name"] for line in lines[::2]] == list(pictures)
+    assert ["pictures" in line for line in lines[1::2]] == [True, False, True]
+
+
 def _form(parts):
     mark = "x" * 20
     body = "".join(f"--{mark}\r\nContent-Disposition: form-data; {h}\r\n\r\n{v}\r\n" for h, v in parts)
@@ -136,16 +153,16 @@ BROKEN = {
     ),
     "bad value": (400, "fov_deg", lambda c, p: c.post("/localize", "a.jpg", p, {"photo": {"fov_deg": -1}})),
     "bad type": (400, "near", lambda c, p: c.post("/localize", "a.jpg", p, {"prior": {"near": "here"}})),
-    "many files": (
+    "one name": (
         400,
-        "one file",
+        "two pictures named 'a'",
         lambda c, p: c.ask(
-            "POST", "/localize", **_form([(f'name="picture"; filename="{k}"', "b") for k in "ab"])
+            "POST", "/localize", **_form([(f'name="picture"; filename="{k}"', "b") for k in "aa"])
         ),
     ),
-    "very many": (
+    "many options": (
         400,
-        "one file",
+        "found options twice",
         lambda c, p: c.ask("POST", "/localize", **_form([('name="options"', "b") for _ in range(20)])),
     ),
     "a field": (

@@ -12,8 +12,8 @@ import rooms
 from batches import untimed
 
 import piccolo
+from piccolo.batch.jobs import steps_file
 from piccolo.cli import localize as localize_command
-from piccolo.cli.together import steps_file
 from piccolo.errors import InputError
 from piccolo.export.formats import tum_lines
 from piccolo.geometry.pose import Pose, carry, pose_errors, yaw_rotation

@@ -1,36 +1,24 @@
-"""Answers to the photos of a batch, in this process or where else the scan is opened.
-
-Photos that are unsure, or off in focal length, get a second look with that of others, or beside sure ones.
-"""
+"""Answers to the photos of a batch, in this process or where else the scan is opened."""
 
 import json
-import math
-from bisect import bisect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from .. import __version__
 from ..camera import Calibration
 from ..cloud.settings import CloudSettings
-from ..errors import InputError, is_passing
-from ..evidence.focal_length import WIDE
 from ..files.atomic import temporary_folder, write_temporary
 from ..files.json_file import reading_once
 from ..jobs.cluster import find_sent_file
 from ..jobs.memory import limit_memory
 from ..jobs.processes import WorkerLostError
 from ..jobs.threads import Workers
-from ..judge.conclude import follow_consensus
-from ..judge.consensus import Consensus
-from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..judge.result import Result
-from ..judge.result_parts import Beside, FocalLength, Source
-from ..judge.sure import SURE_CONFIDENCE
+from ..judge.result_parts import Source
 from ..localization.means import Step, Trace
 from ..opening import open_files
 from ..photo import Photo, Vector
@@ -39,139 +27,12 @@ from ..problem.settings import CoarseToFineSettings
 from ..scan import Scan
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
-from ..second_look import localize_again, place_keypoints
+from ..scan_photo import Asked
+from ..second_look import Place
 from ..together.beside import SurePhoto
+from ..together.second_looks import MOST_PICTURES, Look, localize_in_order
 from ..views.pictures import encode_image, overlay_png
 from .inputs import PriorTable
-
-BESIDE = "photos beside others"
-MOST_PICTURES = 200  # beside which a photo is looked at again
-BETTER = 0.7  # others' deviation must be below this fraction of the photo's own
-ONE_CAMERA = 1.02  # largest ratio of neighbouring given focal lengths of one camera: focusing changes them
-TOLD_CHANGE = 1e-3  # of a confidence: a smaller one is not written again
-
-
-class Look(NamedTuple):
-    """A photo to look at again."""
-
-    number: int  # in the batch
-    status: str  # so far
-    pano: str
-    first: str  # JSON of its result without the others; empty if that is to be computed again
-    beside: tuple[str, ...]  # JSON of the results of photos that are sure
-    asked_sha256: str  # digest of these
-    focal: FocalLength | None = None  # as found so far, with what other photos of the camera say
-
-
-def is_doubtful(result: Result) -> bool:
-    """Return True for a photo with `cameras` that is not localized, or was not without others beside it."""
-    was_doubtful = result.beside is not None or result.status in (AMBIGUOUS, NOT_LOCALIZED)
-    return bool(result.cameras) and was_doubtful
-
-
-def may_change(text: str) -> bool:
-    """Return True if other photos may change the result in a line."""
-    result = Result.from_json(text)
-    return is_doubtful(result) or result.focal_length is not None
-
-
-def list_looks_by_focal(texts: Sequence[str]) -> list[Look]:
-    """List the photos whose focal length others know better, if they are not localized or theirs is off."""
-    results = list(map(Result.from_json, texts))
-    looks = []
-    for camera in group_by_camera(results):
-        consensus = Consensus([known.opinion for _, known in camera])
-        for n, (k, focal) in enumerate(camera):
-            others = consensus.opinion(without=n)
-            if others is None or focal.others_px is not None:
-                continue
-            px = focal.given_px * math.exp(others.off)
-            std_px = math.sqrt(others.variance) * px
-            told = replace(focal, others_px=px, others_std_px=std_px)
-            is_off = abs(px - focal.px) > focal.std_px
-            status = results[k].status
-            if std_px < BETTER * focal.std_px and (is_off or status != LOCALIZED):
-                looks.append(Look(k, status, results[k].pano, "", (), digest_of([]), told))
-    return looks
-
-
-def list_changed_by_consensus(texts: Sequence[str], min_confidence: float) -> list[tuple[int, str, Result]]:
-    """List the results that all photos of a camera change, by number, each with its status before.
-
-    Together they may confirm the focal length given, doubt it, or contradict it.
-    """
-    results = list(map(Result.from_json, texts))
-    changed = []
-    for camera in group_by_camera(results):
-        consensus = Consensus([known.opinion for _, known in camera]).opinion()
-        if consensus is None:
-            continue
-        for k, _ in camera:
-            before = results[k]
-            after = follow_consensus(before, consensus, min_confidence)
-            after = replace(after, warnings=tuple(dict.fromkeys(after.warnings)))
-            is_other = after.status != before.status or after.warnings != before.warnings
-            if is_other or abs(after.confidence - before.confidence) > TOLD_CHANGE:
-                changed.append((k, before.status, after))
-    return changed
-
-
-def group_by_camera(results: Sequence[Result]) -> list[list[tuple[int, FocalLength]]]:
-    """Return numbers and focal lengths of photos by camera: of one size, source and about what was given.
-
-    Those whose focal length was a mere guess are left out.
-    """
-    known = [
-        (result.source.image_size or (0, 0), focal.source, focal.given_px, k, focal)
-        for k, result in enumerate(results)
-        if (focal := result.focal_length) is not None and focal.prior_deviation <= WIDE
-    ]
-    groups: list[list[tuple[int, FocalLength]]] = []
-    camera: tuple[object, ...] = ()
-    largest = 0.0
-    for size, source, px, k, focal in sorted(known, key=lambda one: one[:4]):
-        if (size, source) != camera or px > largest:
-            groups.append([])
-        groups[-1].append((k, focal))
-        camera = size, source
-        largest = ONE_CAMERA * px
-    return groups
-
-
-def list_looks_beside(texts: Sequence[str]) -> list[Look]:
-    """List the photos that are not sure, each with others that are.
-
-    These are the nearest in order: what was taken one after another mostly belongs together. A photo that was
-    looked at beside the same photos is done.
-    """
-    results = list(map(Result.from_json, texts))
-    sure = [
-        k
-        for k, result in enumerate(results)
-        if result.status == LOCALIZED and result.confidence >= SURE_CONFIDENCE and result.beside is None
-    ]
-    looks = []
-    for k, result in enumerate(results):
-        if not is_doubtful(result):
-            continue
-        place = bisect(sure, k)
-        around = sure[max(place - MOST_PICTURES, 0) : place + MOST_PICTURES]
-        near = sorted(sorted(around, key=lambda n: abs(n - k))[:MOST_PICTURES])
-        asked = digest_of([results[n] for n in near])
-        if asked != (result.beside.asked_sha256 if result.beside else digest_of([])):
-            first = "" if result.beside and result.beside.photos else texts[k]
-            beside = tuple(texts[n] for n in near)
-            looks.append(Look(k, result.status, result.pano, first, beside, asked, result.focal_length))
-    return looks
-
-
-LISTINGS = (list_looks_by_focal, list_looks_beside)  # in their order
-
-
-def digest_of(results: Sequence[Result]) -> str:
-    """Return a digest of photos: of their paths and contents."""
-    photos = [(result.pano, result.source.pano_sha256) for result in results]
-    return sha256(json.dumps(photos).encode()).hexdigest()
 
 
 class Task(NamedTuple):
@@ -189,11 +50,15 @@ class Task(NamedTuple):
             yield replace(self.photo, picture=folder / self.photo.path)
             return
         with temporary_folder() as temporary:
-            for name, content in self.files.items():
-                path = temporary / name
-                path.parent.mkdir(parents=True, exist_ok=True)
-                write_temporary(path, content)
+            self.write_files(temporary)
             yield replace(self.photo, picture=temporary / self.photo.path.name)
+
+    def write_files(self, folder: Path) -> None:
+        """Write the files that the task has into a folder."""
+        for name, content in (self.files or {}).items():
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_temporary(path, content)
 
 
 def files_of(pano: Path) -> dict[str, bytes]:
@@ -295,38 +160,45 @@ class Localizer:
         scan = open_files(paths, self.cloud_settings, self.settings, self.cache, workers)
         return replace(scan, name=self.name)
 
-    def answer(self, scan: Scan, place_keypoints: Callable[[str], SurePhoto | None], task: Task) -> Answer:
+    def answer(self, scan: Scan, place_keypoints: Place, task: Task) -> Answer:
         """Localize one photo, and make the pictures asked for; of one that can't be read say why.
 
-        `place_keypoints` returns a photo that is sure by its result's JSON.
+        `place_keypoints` returns a photo that is sure by its result.
         """
         name = task.photo.name
         trace = Trace(self.is_traced)
         with task.place(self.folder) as photo, reading_once():
             try:
                 if task.look is None:
-                    found = scan.localize_photo(photo, task.settings, trace=trace)
+                    found = scan.localize_photo(Asked(photo, task.settings), trace=trace)
                 else:
-                    found = look_again(scan, photo, task.settings, task.look, place_keypoints)
-                overlay, mask = self._pictures(scan, photo, found)
+                    found = scan.look_again(Asked(photo, task.settings), task.look, place_keypoints)
+                overlay, mask = self.make_pictures(scan, photo, found)
             except Exception as error:
                 return Answer(scan.reader.make_failed(photo, error, task.settings, name))
         warnings = tuple(warning.replace(photo.name, name) for warning in found.warnings)
         result = replace(found, pano=name, warnings=warnings)
         return Answer(result, warnings[len(scan.warnings) :], overlay, mask, tuple(trace.steps))
 
-    def place_keypoints(self, scan: Scan, line: str) -> SurePhoto | None:
-        """Return a photo that is sure, by the JSON of its result; None if it is another or none any more."""
-        result = Result.from_json(line)
+    def place_keypoints(self, scan: Scan, result: Result) -> SurePhoto | None:
+        """Return the keypoints of a photo that is sure, by its result; None if it is another now."""
         photo, settings = self.ask(Path(result.pano))
-        try:
-            photo = replace(photo, picture=self.folder / photo.path)
-            scan_map, settings = scan.require_default_method(BESIDE, settings)
-            return place_keypoints(scan_map, scan.reader, scan.workers, photo, result, settings)
-        except (OSError, InputError) as error:
-            if is_passing(error):
-                raise
-        return None
+        photo = replace(photo, picture=self.folder / photo.path)
+        return scan.place_keypoints(Asked(photo, settings), result)
+
+    def answer_together(self, scan: Scan, tasks: Sequence[Task]) -> list[Result]:
+        """Localize photos that were sent together, of the same options, and help each other."""
+        with temporary_folder() as folder:
+            for task in tasks:
+                task.write_files(folder)
+            photo, settings = tasks[0][:2]
+            here = replace(self, folder=folder, photo=photo, settings=settings, priors=None)
+            answer = here.answer_in(scan)
+
+            def localize(task: Task, look: Look | None = None) -> Result:
+                return answer(task._replace(files=None, look=look)).result
+
+            return list(localize_in_order(tasks, localize, localize, settings.min_confidence))
 
     def give_up(self, task: Task, error: WorkerLostError, cloud_sha256: str | None) -> Answer:
         """Return the answer to a task whose workers were lost."""
@@ -335,7 +207,7 @@ class Localizer:
         about = {"settings": settings, "source": Source(cloud_sha256)}
         return Answer(unreadable_result(f"{name}: {error}", self.name, name, is_passing=True, **about))
 
-    def _pictures(self, scan: Scan, photo: Photo, result: Result) -> tuple[bytes | None, bytes | None]:
+    def make_pictures(self, scan: Scan, photo: Photo, result: Result) -> tuple[bytes | None, bytes | None]:
         """Overlay and occlusion mask as PNG, where they are asked for and there is a pose."""
         overlay = mask = None
         pose = result.best_pose
@@ -348,24 +220,3 @@ class Localizer:
         if self.makes_occlusion_masks:
             mask = encode_image(scan.occlusion_mask(photo, pose), ".png")
         return overlay, mask
-
-
-def look_again(
-    scan: Scan,
-    photo: Photo,
-    settings: Settings,
-    look: Look,
-    place_keypoints: Callable[[str], SurePhoto | None],
-) -> Result:
-    """Localize a photo again: with the focal length that others tell, or beside others."""
-
-    def list_pictures() -> dict[str, SurePhoto]:
-        found = ((json.loads(line)["pano"], place_keypoints(line)) for line in look.beside)
-        return {name: picture for name, picture in found if picture}
-
-    first = Result.from_json(look.first) if look.first else scan.localize_photo(photo, settings, look.focal)
-    if not look.beside:
-        return replace(first, beside=None)
-    scan_map, settings = scan.require_default_method(BESIDE, settings)
-    found, names = localize_again(scan_map, scan.reader, scan.workers, photo, first, list_pictures, settings)
-    return replace(found, beside=Beside(names, look.asked_sha256))

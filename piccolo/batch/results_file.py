@@ -9,8 +9,8 @@ from typing import Any, NamedTuple, TypeVar
 
 from ..errors import InputError
 from ..files.line_file import LineFile, whole_lines, whole_size
-from ..judge.result import FAILED, FORMAT
-from .localizer import may_change
+from ..judge.result import FAILED, FORMAT, Result
+from ..together.second_looks import may_change
 
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
 WAYS = "use `overwrite` to start again, or another `out`"
@@ -179,13 +179,13 @@ class StreamOutput:
             self._write(text)
             return
         self._texts.append(text)
-        self._is_waiting = self._is_waiting or may_change(text)
+        self._is_waiting = self._is_waiting or may_change(Result.from_json(text))
         if not self._is_waiting:
             self.close()
 
-    def texts(self) -> list[str]:
-        """Return the lines so far."""
-        return self._texts
+    def results(self) -> list[Result]:
+        """Return the results so far."""
+        return list(map(Result.from_json, self._texts))
 
     def replace(self, number: int, text: str) -> None:
         """Replace a photo's line."""
@@ -222,9 +222,9 @@ class FileOutput:
         spans = [line.span if line else next(new_spans) for line in self._records.order]
         return [self._replaced.get(k, span) for k, span in enumerate(spans)]
 
-    def texts(self) -> list[str]:
-        """Return the lines of the photos so far, in their order."""
-        return [self._file.read(*span).decode() for span in self._spans()]
+    def results(self) -> list[Result]:
+        """Return the results of the photos so far, in their order."""
+        return [Result.from_json(self._file.read(*span).decode()) for span in self._spans()]
 
     def replace(self, number: int, text: str) -> None:
         """Append a line that is to replace that of a photo, by its number in the order."""

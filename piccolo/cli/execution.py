@@ -1,15 +1,12 @@
 """The work of a batch: in this process, several, or a cluster, until a signal ends it."""
 
-import os
-import signal
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import FrameType
-from typing import Any, TypeVar
+from typing import Any
 
 from tqdm import tqdm
 
@@ -17,6 +14,7 @@ from ..batch.localizer import Answer, Localizer, Task
 from ..errors import InputError, printable
 from ..evidence.focal_length import WIDE
 from ..jobs.cluster import Cluster, connect
+from ..jobs.interruption import SIGNALS, Interruption
 from ..jobs.memory import GB, memory_left, memory_taken
 from ..jobs.processes import Here, Processes, WorkerLostError
 from ..jobs.threads import num_cores
@@ -33,8 +31,6 @@ from .start import for_terminal
 
 EXIT_SOME_NOT = 1
 QUERY_MEMORY = 0.5e9  # [byte] of a process beside the map
-SIGNALS: dict[int, str] = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
-Item = TypeVar("Item")
 Executor = Here | Processes | Cluster
 
 
@@ -168,62 +164,12 @@ def at_the_workers(
     return replace(localizer, folder=here, map_name=path.name, sends_photos=not is_shared)
 
 
-class Stopped(KeyboardInterrupt):
-    """A signal came while nothing was at work, or for the second time."""
-
-
-@dataclass
-class Interruption:
-    """Whether Ctrl-C or SIGTERM is to end a batch, whose photo at work is finished first."""
-
-    number: int = 0  # of the signal
-    is_at_work: bool = False
-
-    def each(self, items: Iterable[Item], after: Iterable[Item] = ()) -> Iterator[Item]:
-        """Yield items until a signal ends it, and then those `after`.
-
-        While one is at work, a first signal is only noted, a second one ends the work at once.
-        """
-        try:
-            for item in items:
-                self.is_at_work = True
-                yield item
-                self.is_at_work = False
-                if self.number:
-                    break
-            self.is_at_work = True
-            yield from after
-        finally:
-            self.is_at_work = False
-
-    def stop(self, arguments: Arguments, done: str, is_kept: bool) -> int:
-        """Say what a signal has ended and how to go on; returns the code that a shell expects of that."""
-        same = "the same command"
-        how = f"{same} continues from here" if is_kept else f"with --out FILE {same} would continue"
-        text = f"ended by {SIGNALS[self.number]} after {done}; {how}"
-        return arguments.error(text, 128 + self.number)
-
-    def handle(self, number: int, _frame: FrameType | None) -> None:
-        """Note a signal; raises Stopped where it ends the work at once."""
-        is_second = self.number != 0
-        self.number = self.number or number
-        if is_second or not self.is_at_work:
-            raise Stopped
-        os.write(2, f"\n{SIGNALS[number]}: the current photo will be finished; repeat to stop now\n".encode())
-
-
-@contextmanager
-def interruptible() -> Iterator[Interruption]:
-    """Within this, signals end the batch as Interruption says; one that ends it at once ends the context."""
-    interruption = Interruption()
-    before = {number: signal.signal(number, interruption.handle) for number in SIGNALS}
-    try:
-        yield interruption
-    except Stopped:
-        pass
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def stop(interruption: Interruption, arguments: Arguments, done: str, is_kept: bool) -> int:
+    """Say what a signal has ended and how to go on; returns the code that a shell expects of that."""
+    same = "the same command"
+    how = f"{same} continues from here" if is_kept else f"with --out FILE {same} would continue"
+    text = f"ended by {SIGNALS[interruption.number]} after {done}; {how}"
+    return arguments.error(text, 128 + interruption.number)
 
 
 def answer_all(

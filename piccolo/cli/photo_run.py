@@ -6,7 +6,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -14,28 +14,33 @@ from typing import Any
 
 import numpy as np
 
+from ..arguments import PICTURES
 from ..batch.inputs import describe_left_out, is_from_stdin, list_panoramas, read_priors
-from ..batch.localizer import LISTINGS, Answer, Localizer, Look, list_changed_by_consensus
+from ..batch.localizer import Answer, Localizer
 from ..batch.results_file import FileOutput, Output, Records, StreamOutput
 from ..errors import InputError
 from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, temporary_folder, write_atomically
 from ..files.line_file import open_locked, write_line
+from ..jobs.interruption import Interruption, interruptible
 from ..jobs.memory import limit_memory
 from ..jobs.threads import Stopwatch, num_cores
 from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
-from ..judge.result import FAILED, UNREADABLE
+from ..judge.result import FAILED, UNREADABLE, Result
+from ..localization.means import Step
 from ..panorama import read_panorama
 from ..panorama.cube import is_cube
 from ..panorama.masks import find_mask
 from ..panorama.photo import sha256_of
+from ..photo import Photo
 from ..problem.settings import CoarseToFineSettings
 from ..scan import Scan
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
+from ..together.second_looks import LISTINGS, Change, Look, follow_cameras, revise
 from ..views.pictures import encode_image
 from . import execution, terminal, together
 from .command import Arguments, UsageError, check_distinct, check_suffix, checking_options
-from .execution import Executor, Interruption
+from .execution import Executor
 from .options import check_arguments
 from .settings import localizer_from
 
@@ -174,27 +179,34 @@ def open_output(run: Run) -> Iterator[tuple[Output, Records]]:
 
 def record(run: Run, answer: Answer, write: Write) -> None:
     """Write the pictures asked for and the result, and say what was found."""
-    arguments = run.arguments
     result = answer.result
-    name = Path(result.pano).stem
-    while len(os.fsencode(name)) > MAX_STEM:
-        name = name[:-1]
-    pictures = (arguments.overlay, answer.overlay), (arguments.occlusion_mask, answer.occlusion_mask)
-    for path, png in pictures:
-        if path and png is not None:
-            write_atomically(path / f"{name}.png" if path.is_dir() else path, png)
-    execution.print_result(arguments, result, answer.warnings)
-    write_steps(run, answer)
+    write_pictures(run.arguments, result.pano, answer.overlay, answer.occlusion_mask)
+    execution.print_result(run.arguments, result, answer.warnings)
+    write_steps(run, result.pano, answer.steps)
     write(result.to_json())
     run.counts[result.status] += 1
     if result.best_pose is not None and result.pose is None and not result.cameras:
         run.doubtful.append(result.pano)
 
 
-def write_steps(run: Run, answer: Answer) -> None:
+def write_pictures(
+    arguments: Arguments, pano: str, overlay: bytes | None, occlusion_mask: bytes | None
+) -> None:
+    """Write the pictures of a photo that are asked for, in folders by its name."""
+    path = Path(pano)
+    name = path.stem if path.suffix.lower() in PICTURES else path.name  # of a frame of a video, with its time
+    while len(os.fsencode(name)) > MAX_STEM:
+        name = name[:-1]
+    pictures = (arguments.overlay, overlay), (arguments.occlusion_mask, occlusion_mask)
+    for place, png in pictures:
+        if place and png is not None:
+            write_atomically(place / f"{name}.png" if place.is_dir() else place, png)
+
+
+def write_steps(run: Run, pano: str, steps: Sequence[Step]) -> None:
     """Write the steps of a photo's search to the file of --trace, if it is asked for."""
-    for step in answer.steps:
-        run.write_step(json.dumps({"pano": answer.result.pano, **step}))
+    for step in steps:
+        run.write_step(json.dumps({"pano": pano, **step}))
 
 
 @contextmanager
@@ -218,58 +230,52 @@ def localize_all(
     bar["initial"] = records.counts.total()
     show = partial(terminal.show_progress, is_quiet=run.arguments.quiet or is_one, **bar)
     tasks = map(run.localizer.task, left)
-    with execution.interruptible() as interruption:
+    with interruptible() as interruption:
         signals = None if is_one else interruption
         for answer in execution.answer_all(executor, run.localizer, tasks, show, signals, run.cloud_sha256):
             record(run, answer, write)
     return interruption
 
 
-def follow_consensus(run: Run, output: Output) -> Sequence[str]:
-    """Change results by what all photos of a camera say of its focal length; return the lines."""
-    settings = run.localizer.settings
-    if not isinstance(settings, CoarseToFineSettings):
-        return output.texts()
-    for number, status, result in list_changed_by_consensus(output.texts(), settings.min_confidence):
-        replace_line = partial(output.replace, number)
-        if result.status == status:
-            replace_line(result.to_json())
-        else:
-            run.counts[status] -= 1
-            record(run, Answer(result, result.warnings), replace_line)
-    return output.texts()
+def record_change(run: Run, change: Change, answer: Answer, output: Output) -> None:
+    """Replace a result by what others have made of it, and say so if that is news."""
+    replace_line = partial(output.replace, change.number)
+    if change.is_news:
+        run.counts[change.before.status] -= 1
+        record(run, answer, replace_line)
+    else:
+        replace_line(change.after.to_json())
+
+
+def follow_all_cameras(run: Run, results: list[Result], output: Output) -> None:
+    """Change results by what all photos of a camera say of its focal length."""
+    for change in follow_cameras(results, run.localizer.settings.min_confidence):
+        record_change(run, change, Answer(change.after, change.after.warnings), output)
 
 
 def look_again(run: Run, executor: Executor, output: Output) -> Interruption:
     """Look again at photos, with what others say of their camera, then beside others, until a signal."""
     localizer = run.localizer
-    for list_looks in LISTINGS:
-        looks = list_looks(follow_consensus(run, output))
-        tasks = (localizer.task(Path(look.pano))._replace(look=look) for look in looks)
-        bar: dict[str, Any] = {"desc": "second look", "total": len(looks), "unit": ""}
-        show = partial(terminal.show_progress, is_quiet=run.arguments.quiet, **bar)
-        with execution.interruptible() as interruption:
+    answered: dict[int, Answer] = {}
+    with interruptible() as interruption:
+
+        def ask(looks: Sequence[Look]) -> Iterator[Result]:
+            if interruption.number:
+                return
+            tasks = (localizer.task(Path(look.pano))._replace(look=look) for look in looks)
+            bar: dict[str, Any] = {"desc": "second look", "total": len(looks), "unit": ""}
+            show = partial(terminal.show_progress, is_quiet=run.arguments.quiet, **bar)
             answers = execution.answer_all(executor, localizer, tasks, show, interruption, run.cloud_sha256)
             for look, answer in zip(looks, answers, strict=False):
-                record_second(run, look, answer, output)
-        if interruption.number:
-            return interruption
-    follow_consensus(run, output)
+                if answer.result.error is not None:
+                    run.arguments.error(answer.result.error)
+                answered[look.number] = answer
+                yield answer.result
+
+        for change in revise(output.results(), ask, localizer.settings.min_confidence):
+            answer = answered.pop(change.number, None) or Answer(change.after, change.after.warnings)
+            record_change(run, change, answer, output)
     return interruption
-
-
-def record_second(run: Run, look: Look, answer: Answer, output: Output) -> None:
-    """Replace a result by that of a second look; if that failed, say why."""
-    result = answer.result
-    replace_line = partial(output.replace, look.number)
-    is_other = not look.first or (result.beside is not None and result.beside.photos)
-    if result.error is not None:
-        run.arguments.error(result.error)
-    elif is_other:
-        run.counts[look.status] -= 1
-        record(run, answer, replace_line)
-    else:
-        replace_line(result.to_json())
 
 
 def note_left_handed(run: Run, records: Records, executor: Executor, interruption: Interruption) -> None:
@@ -308,7 +314,9 @@ def finish(run: Run, records: Records, output: Output, interruption: Interruptio
         parts = note, dropped, describe_left_out(run.left_out)
         arguments.note("; ".join(filter(None, parts)))
     if interruption.number:
-        return interruption.stop(arguments, f"{counts.total()} results", isinstance(output, FileOutput))
+        return execution.stop(
+            interruption, arguments, f"{counts.total()} results", isinstance(output, FileOutput)
+        )
     if run.total is None:
         note_unused_priors(arguments, run.localizer)
     return execution.choose_exit_code(+counts)
@@ -317,21 +325,30 @@ def finish(run: Run, records: Records, output: Output, interruption: Interruptio
 def run_jointly(run: Run) -> int:
     """Localize photos that help each other, return the exit code."""
     arguments = run.arguments
-    settings = run.localizer.settings
-    if not isinstance(settings, CoarseToFineSettings):
+    localizer = run.localizer
+    if not isinstance(localizer.settings, CoarseToFineSettings):
         option = next(name for name in JOINT if getattr(arguments, name))
         raise UsageError(f"--{option.replace('_', '-')}: not an option of the preset paper")
     photos = list(run.panoramas)
-    opening = partial(open_scan, run, run.localizer, arguments.threads or num_cores())
-    if arguments.walk or arguments.video:
-        with together.walk_frames(arguments, run.localizer.photo, photos) as (frames, motion):
+    steps_of = partial(write_steps, run)
+    with ExitStack() as stack:
+        if arguments.walk or arguments.video:
+            taken = together.walk_frames(arguments, localizer.photo, photos)
+            frames, motion = stack.enter_context(taken)
             if run.left_out:
                 arguments.note(describe_left_out(run.left_out))
-            scan = opening()
-            job = together.make_walk_job(arguments, frames, scan, scan.track(motion=motion))
-            return together.run_together(arguments, job)
-    make_job = together.make_bundle_job if arguments.relative else together.make_coloring_job
-    return together.run_together(arguments, make_job(arguments, photos, run.localizer, opening()))
+            scan = open_scan(run, localizer, arguments.threads or num_cores())
+            asked = together.ask_for_walk(arguments, frames, scan, motion, steps_of)
+        else:
+            scan = open_scan(run, localizer, arguments.threads or num_cores())
+            ask = together.ask_for_bundle if arguments.relative else together.ask_for_coloring
+            asked = ask(arguments, photos, localizer, scan, steps_of)
+        stack.enter_context(tracing(run))
+
+        def write(photo: Photo, result: Result) -> None:
+            write_pictures(arguments, result.pano, *localizer.make_pictures(scan, photo, result))
+
+        return together.run_together(arguments, asked, write)
 
 
 def localize_photos(arguments: Arguments) -> int:
@@ -353,8 +370,9 @@ def localize_photos(arguments: Arguments) -> int:
             left = iter(known)
             num_left = len(known)
         first = next(left, None)
-        texts = follow_consensus(run, output) if first is None and run.looks_again else []
-        looks = [look for list_looks in LISTINGS for look in list_looks(texts)]
+        results = output.results() if first is None and run.looks_again else []
+        follow_all_cameras(run, results, output)
+        looks = [look for list_looks in LISTINGS for look in list_looks(results)]
         if first is None and not looks:
             arguments.note(f"{arguments.out or 'nothing'}: nothing is left to do")
             return finish(run, records, output, Interruption(), 0.0)

@@ -4,8 +4,8 @@ A point's colour is the weighted median of the photos that see it, so that no si
 the others contradict do not count.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,6 +46,10 @@ SAMPLES = 1 << 21  # of photos at points, that a task holds
 LEAST_PAINTED = 0.25  # of what a photo sees that must have paint; with less, most right ones were refused
 MOST_PHOTOS = 255  # that are counted for a point
 FULL_LEVEL = np.float32(255.0)
+
+
+Localize = Callable[[ScanMap, int], Result]  # a photo by its number, in the map or in one of other colours
+OF_RESULTS = {"colors": "those of the other photos"}  # settings that results repeat
 
 
 class Brush(NamedTuple):
@@ -172,10 +176,41 @@ class Colored(NamedTuple):
     num_colored: int  # points that a photo sees
 
 
+@dataclass(frozen=True)
+class Coloring:
+    """A scan that was coloured by photos, and the photos in it."""
+
+    results: list[Result]  # one of each photo, in order
+    num_points: int  # of the scan that was written; 0 if none was, as fewer than two photos are localized
+    num_colored: int  # of these, that a photo sees
+
+
+def localize_for_colors(
+    scan_map: ScanMap,
+    steps: Iterable[str],
+    localize: Localize,
+    num_photos: int,
+    workers: Workers,
+    journal: Journal,
+) -> list[Result]:
+    """Localize photos by a scan as it is, and then in the colours that the others give to it.
+
+    `localize` makes the result of a photo by its number, `steps` names those of the scan as it is. Results
+    that the journal has are not computed again.
+    """
+    names = [*steps]
+    by_shape = journal.recall(names, lambda _, text: Result.from_json(text))
+    left = range(len(by_shape), num_photos)
+    for k in workers.show(iter(left), len(left), "photos"):
+        by_shape.append(localize(scan_map, k))
+        keep_step(journal, names[k], by_shape[k])
+    return localize_by_colors(scan_map, by_shape, localize, workers, journal)
+
+
 def localize_by_colors(
     scan_map: ScanMap,
     by_shape: Sequence[Result],
-    localize: Callable[[ScanMap, int], Result],
+    localize: Localize,
     workers: Workers,
     journal: Journal,
 ) -> list[Result]:
@@ -243,11 +278,10 @@ def write_colored_scan(
 ) -> Colored:
     """Write the points of a scan's files in the colours of photos that were localized in its map.
 
-    Points that no photo sees are black. Raises InputError if the scan is a prepared map, if fewer than two
-    photos are localized, and for an unknown suffix.
+    Points that no photo sees are black. Raises InputError if the scan is not of such files, if fewer than
+    two photos are localized, and for an unknown suffix.
     """
-    if find_prepared_map(paths):
-        raise InputError(f"{paths[0]}: found no files of points, wanted those of a scan to be coloured")
+    check_files(paths)
     check_suffix(out)
     brushes = make_aligned_brushes(scan_map, results, workers)
 
@@ -262,6 +296,27 @@ def write_colored_scan(
     for line in describe_unit(cloud, out, scan_map.crs):
         workers.warn(line)
     return Colored(len(brushes), *counts)
+
+
+def color_if_enough(
+    paths: Sequence[Path],
+    scan_map: ScanMap,
+    cloud_settings: CloudSettings,
+    results: list[Result],
+    out: Path,
+    workers: Workers,
+) -> Coloring:
+    """Write a scan in the colours of photos, if enough of them are localized."""
+    if sum(result.pose is not None for result in results) < LEAST_COLORING_PHOTOS:
+        return Coloring(results, 0, 0)
+    colored = write_colored_scan(paths, scan_map, cloud_settings, results, out, workers)
+    return Coloring(results, colored.num_points, colored.num_colored)
+
+
+def check_files(paths: Sequence[Path]) -> None:
+    """Refuse a scan that is not of files of points: a prepared map, or arrays."""
+    if find_prepared_map(paths) or not all(path.exists() for path in paths):
+        raise InputError(f"{paths[0]}: found no files of points, wanted those of a scan to be coloured")
 
 
 def check_suffix(out: Path) -> None:

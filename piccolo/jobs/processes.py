@@ -148,9 +148,12 @@ class Processes:
         """Begin with the items."""
         return InFlight(self.submit, items, IN_FLIGHT * self.num_processes)
 
-    def submit(self, item: object) -> Future[Any]:
-        """Begin with an item as soon as a process is free; its future raises what `Pair` says."""
-        return self._threads.submit(self._value_of, item)
+    def submit(self, item: object, num: int = 1) -> Future[Any]:
+        """Begin with an item as soon as a process is free; its future raises what `Pair` says.
+
+        An item that is `num` items in one may take so many times as long.
+        """
+        return self._threads.submit(self._value_of, item, num)
 
     def close(self) -> None:
         """Kill the processes, whatever they are doing."""
@@ -160,13 +163,14 @@ class Processes:
                 child.kill()
         self._threads.shutdown(cancel_futures=True)
 
-    def _value_of(self, item: object) -> Any:
+    def _value_of(self, item: object, num: int) -> Any:
         """Ask this thread's process for a value."""
+        seconds = self.seconds and num * self.seconds
         for _ in range(self.attempts):
             pool, child = self._worker()
             try:
                 future = pool.submit(_value_of, item)
-                return future.result(self.seconds)
+                return future.result(seconds)
             except BrokenProcessPool:
                 end = self._end_of(pool, child)
             except TimeoutError:
@@ -174,7 +178,7 @@ class Processes:
                     raise
                 child.kill()
                 self._end_of(pool, child)
-                raise TooSlowError(f"it took more than {self.seconds} s") from None
+                raise TooSlowError(f"it took more than {seconds} s") from None
         who = "the process" if self.attempts == 1 else f"each of {self.attempts} processes"
         raise WorkerLostError(f"{who} at work on it {end}")
 

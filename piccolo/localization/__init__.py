@@ -1,7 +1,7 @@
 """The default method: it localizes a panorama in a prepared scan.
 
 A photo's way from its file to a result:
-1. `scan.Scan.localize_photo` reads it (`panorama.read_panorama`) and asks for its GPS position;
+1. `scan_photo.localize_photo` reads it (`panorama.read_panorama`) and asks for its GPS position;
 2. `localize.localize` makes a `Problem` of its images and the part of the map that the prior allows;
 3. `attempts.plan_attempts` lists the searches: a brief one by views, local features, all views;
 4. each finds starts (`search.search_poses`) and refines few of them (`beam`, on the stages of `ladder`) to

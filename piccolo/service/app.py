@@ -4,7 +4,7 @@ import asyncio
 import json
 import logging
 import secrets
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
 from importlib.resources import files
@@ -38,7 +38,7 @@ from .keep import Keep
 
 LOG = logging.getLogger(__name__)
 MAX_OPTIONS = 1 << 16  # [byte] of the options' text
-MAX_FORM_PARTS = 8  # of a form: more are not read, to say which is wrong
+MAX_FORM_PARTS = 64  # of a form: more are not read
 SETTLED_S = 1.0  # [s] for which the files of a scan must not change before they are opened again
 LINES = "application/x-ndjson"
 UNBUFFERED = {"X-Accel-Buffering": "no"}  # nginx: a line is sent on at once
@@ -117,34 +117,38 @@ class Service:
         return Response(text, media_type="text/html")
 
     async def localize(self, request: Request) -> Response:
-        """Return the line of a photo, as localize.py writes it."""
-        async with self.asking(request) as task:
+        """Return the line of a photo, as localize.py writes it; of several photos a line for each."""
+        async with self.asking(request) as tasks:
             with self.desk.in_use() as desk:
-                result = await unless_gone(request, self.answer(desk, task))
-                await self.keep_photo(task, result)
-        return Response(result.to_json(), media_type="application/json")
+                results = await unless_gone(request, self.answer(desk, tasks))
+                for task, result in zip(tasks, results, strict=True):
+                    await self.keep_photo(task, result)
+        if len(results) == 1:
+            return Response(results[0].to_json(), media_type="application/json")
+        return Response("".join(f"{result.to_json()}\n" for result in results), media_type=LINES)
 
     async def show(self, request: Request) -> Response:
-        """Return a photo for the page: a line with its result, then a line with its pictures."""
-        async with self.asking(request) as task:
+        """Return photos for the page, of each a line with its result, then a line with its pictures."""
+        async with self.asking(request) as tasks:
             with self.desk.in_use() as desk:
-                result = await unless_gone(request, self.answer(desk, task))
-                kept = await self.keep_photo(task, result)
-        about = photo_document(kept or result.pano, result, desk.scan_map)
+                results = await unless_gone(request, self.answer(desk, tasks))
+                kept = [await self.keep_photo(*one) for one in zip(tasks, results, strict=True)]
 
         async def lines() -> AsyncIterator[str]:
-            yield f'{{"photo": {json.dumps(about)}, "result": {result.to_json()}}}\n'
-            with desk.in_use():
-                try:
-                    yield f"{await self.draw(desk, Drawing(task, result), kept)}\n"
-                except HTTPException as error:
-                    yield f"{json.dumps({'error': error.detail})}\n"
+            for task, result, name in zip(tasks, results, kept, strict=True):
+                about = photo_document(name or result.pano, result, desk.scan_map)
+                yield f'{{"photo": {json.dumps(about)}, "result": {result.to_json()}}}\n'
+                with desk.in_use():
+                    try:
+                        yield f"{await self.draw(desk, Drawing(task, result), name)}\n"
+                    except HTTPException as error:
+                        yield f"{json.dumps({'error': error.detail})}\n"
 
         return StreamingResponse(lines(), media_type=LINES, headers=UNBUFFERED)
 
     async def keep_photo(self, task: Task, result: Result) -> str | None:
         """Return the name under which a photo is kept, if any is; HTTPException if there is no room."""
-        if self.keep is None:
+        if self.keep is None or result.error is not None:
             return None
         with refusing():
             return await asyncio.to_thread(self.keep.add, task.photo.name, content_of(task), result)
@@ -181,28 +185,29 @@ class Service:
         return Response(found, media_type="image/jpeg")
 
     @asynccontextmanager
-    async def asking(self, request: Request) -> AsyncIterator[Task]:
-        """Yield the photo that was sent, when all of it is there; HTTPException if too many wait."""
+    async def asking(self, request: Request) -> AsyncIterator[list[Task]]:
+        """Yield the photos that were sent, when all of them are there; HTTPException if too many wait."""
         self.look_for_another_scan()
         if request.query_params:
             raise HTTPException(400, f"found {min(request.query_params)!r} in the address, {FORM}")
         async with reading_form(request) as form:
-            with self.place():
-                name, content, text = await read_form(form)
+            with self.place(len(form.getlist("picture"))):
+                pictures, text = await read_form(form)
                 await form.close()
                 options = parse_options(text)
-                yield Task(make_photo(name, options), self.settings_of(options), {name: content})
+                settings = self.settings_of(options)
+                yield [Task(make_photo(name, options), settings, {name: pictures[name]}) for name in pictures]
 
     @contextmanager
-    def place(self) -> Iterator[None]:
-        """Hold a place among the photos that wait; HTTPException if all are taken."""
+    def place(self, num: int = 1) -> Iterator[None]:
+        """Hold places for photos among those that wait; HTTPException if all are taken."""
         if self.num_waiting >= self.limits.max_waiting:
             raise HTTPException(503, f"found {self.num_waiting} photos that wait, try again", RETRY)
-        self.num_waiting += 1
+        self.num_waiting += num
         try:
             yield
         finally:
-            self.num_waiting -= 1
+            self.num_waiting -= num
 
     def settings_of(self, options: dict[str, Any]) -> CoarseToFineSettings:
         """Return the service's settings with a request's own in their place."""
@@ -210,15 +215,19 @@ class Service:
         assert isinstance(settings, CoarseToFineSettings)
         return apply_options(settings, options)
 
-    async def answer(self, desk: Desk, task: Task) -> Result:
-        """Localize a photo; HTTPException for one that can't be read."""
-        result: Result = (await work(desk.processes, task)).result
-        if result.status == FAILED:
-            LOG.warning("a photo was given up: %s", result.error)
-            raise HTTPException(503, result.error, RETRY)
-        if result.status == UNREADABLE:
-            raise HTTPException(422, result.error)
-        return result
+    async def answer(self, desk: Desk, tasks: Sequence[Task]) -> list[Result]:
+        """Localize photos together; HTTPException for one alone that can't be read."""
+        results: list[Result] = await work(desk.processes, tasks, len(tasks))
+        for result in results:
+            if result.status == FAILED:
+                LOG.warning("a photo was given up: %s", result.error)
+        if len(results) > 1:
+            return results
+        if results[0].status == FAILED:
+            raise HTTPException(503, results[0].error, RETRY)
+        if results[0].status == UNREADABLE:
+            raise HTTPException(422, results[0].error)
+        return results
 
     def look_for_another_scan(self) -> None:
         """Begin to open the scan again if its files are others now; until it is open the old one answers."""
@@ -260,7 +269,7 @@ async def reading_form(request: Request) -> AsyncIterator[FormData]:
         await form.close()
 
 
-async def unless_gone(request: Request, answer: Coroutine[Any, Any, Result]) -> Result:
+async def unless_gone(request: Request, answer: Coroutine[Any, Any, list[Result]]) -> list[Result]:
     """Return an answer; ClientDisconnect if the client leaves meanwhile: a photo that waits is given up."""
     answering = asyncio.create_task(answer)
     leaving = asyncio.ensure_future(request.receive())  # the body was read, so this is all that can come
@@ -275,11 +284,11 @@ async def unless_gone(request: Request, answer: Coroutine[Any, Any, Result]) -> 
         await asyncio.gather(leaving, answering, return_exceptions=True)
 
 
-async def work(processes: Processes, item: object) -> Any:
+async def work(processes: Processes, item: object, num: int = 1) -> Any:
     """Return what a process says of an item; HTTPException for what it refuses, or did not live to say."""
     future = None
     try:
-        future = processes.submit(item)
+        future = processes.submit(item, num)
         return await asyncio.wrap_future(future)
     except OpeningError as error:
         raise HTTPException(503, f"the scan can't be opened at the moment: {error}", RETRY) from error

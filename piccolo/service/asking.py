@@ -1,4 +1,4 @@
-"""A request: a photo by its name and content, and its options as JSON."""
+"""A request: photos by their names and contents, and their options as JSON."""
 
 import json
 import os
@@ -23,21 +23,29 @@ PRIOR = {f.name for f in fields(Prior)}
 PLACES: dict[str, Collection[str]] = {"options": PARTS, "options.photo": PHOTO, "options.prior": PRIOR}
 # bytes of a photo's name that are kept; a file's name has up to 255, with what is put before it
 MAX_NAME = 240
-FORM = "wanted multipart/form-data with `picture`, one file, and perhaps `options`, one text of JSON"
+FORM = "wanted multipart/form-data with `picture`, a file or several, and perhaps `options`, one text of JSON"
+Pictures = dict[str, bytes]  # contents by names
 
 
-async def read_form(form: FormData) -> tuple[str, bytes, str]:
-    """Return name and content of the picture in a form, and the text of its options."""
+async def read_form(form: FormData) -> tuple[Pictures, str]:
+    """Return the pictures in a form, and the text of its options."""
     for name in form:
         if name not in ("picture", "options"):
             raise InputError(f"{describe_unknown(name, ('picture', 'options'))}; {FORM}")
-    picture = form.get("picture")
+    pictures: Pictures = {}
     text = form.get("options", "")
-    if len(form.multi_items()) != len(form):
-        raise InputError(f"found a part twice, {FORM}")
-    if not isinstance(picture, UploadFile) or not isinstance(text, str):
+    if len(form.getlist("options")) > 1 or not isinstance(text, str):
+        raise InputError(f"found options twice, or as a file, {FORM}")
+    for picture in form.getlist("picture"):
+        if not isinstance(picture, UploadFile):
+            raise InputError(f"found a picture that is no file, {FORM}")
+        name = clean_name(picture.filename or "")
+        if name in pictures:
+            raise InputError(f"found two pictures named {name!r}, wanted names that differ")
+        pictures[name] = await picture.read()
+    if not pictures:
         raise InputError(f"found no picture, {FORM}")
-    return clean_name(picture.filename or ""), await picture.read(), text
+    return pictures, text
 
 
 def clean_name(name: str) -> str:

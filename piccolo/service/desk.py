@@ -12,7 +12,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..batch.localizer import Answer, Localizer, Task
+from ..batch.localizer import Localizer, Task
 from ..errors import InputError
 from ..files.atomic import temporary_folder
 from ..jobs.processes import Function, Processes
@@ -128,7 +128,8 @@ def look_at(paths: Sequence[Path]) -> list[object]:
 def open_answering(localizer: Localizer, max_pixels: float) -> Function:
     """Open what a process answers with.
 
-    A `Task` gets its `Answer`, a `Drawing` the JSON of its pictures; None makes ready for both.
+    Tasks get their results, those of several photos help each other; a `Drawing` gets the JSON of its
+    pictures; None makes ready for both.
     """
     tempfile.tempdir = os.environ.get("TMPDIR")  # or it is tried out, and on a full disk found not to exist
     scan = localizer.open_here()
@@ -139,14 +140,15 @@ def open_answering(localizer: Localizer, max_pixels: float) -> Function:
         points = scan.prepared.points.subsample(MAX_SURFELS)
         return make_surfels(points, scan.workers), points
 
-    def work(item: Task | Drawing | None) -> Answer | str | None:
+    def work(item: Sequence[Task] | Drawing | None) -> list[Result] | str | None:
         if isinstance(item, Drawing):
             return draw(scan, surfels(), item)
         if item is None:
             surfels()
             return None
-        check_size(item, max_pixels)
-        return answer(item)
+        for task in item:
+            check_size(task, max_pixels)
+        return [answer(item[0]).result] if len(item) == 1 else localizer.answer_together(scan, item)
 
     return work
 

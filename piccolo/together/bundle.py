@@ -20,14 +20,14 @@ from ..evidence.focal_length import FocalFit
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_within, subtract
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
-from ..judge.by_others import Shares, believe_together
+from ..judge.by_others import LOCAL_ERRORS, Shares, believe_together
 from ..judge.candidate import Selection
 from ..judge.consensus import MOST_CONFLICT
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result, nothing_found
 from ..localization.calibration import calibrate
 from ..localization.judging import Found, judge_together
-from ..localization.means import Means
+from ..localization.means import NO_TRACE, Means, Trace
 from ..panorama import Panorama
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
@@ -50,10 +50,9 @@ from .bundle_search import (
     propose_bundles,
     weigh_bundles,
 )
-from .members import Member, find_members
+from .members import Member, Shot, find_members
 
 EVEN_ODDS = 0.5
-LOCAL_ERRORS = np.diag(np.repeat([math.radians(2.0) ** 2, 0.15**2], 3))  # chosen: of local optima, [rad, m]
 NUM_EXCHANGED = 8  # chosen: photos whose relative pose another may have by mistake
 MOST_GAIN = 3.0  # [log] by being where it was to be expected
 TOLD = 2.0  # deviations of the scale, and ratio of other errors to those expected, that are reported
@@ -73,25 +72,30 @@ class Agreed(NamedTuple):
     warnings: tuple[str, ...]
 
 
+class Posed(NamedTuple):
+    """A photo whose pose relative to others is known."""
+
+    panorama: Panorama
+    cam_from_bundle: Pose  # in any common frame
+    settings: CoarseToFineSettings
+    trace: Trace = NO_TRACE
+
+
 @one_blas_thread()
 def localize_bundle(
-    scan_map: ScanMap,
-    panoramas: Sequence[Panorama],
-    cams_from_bundle: Sequence[Pose],
-    settings: CoarseToFineSettings,
-    workers: Workers,
-    watch: Stopwatch,
-    errors: RelativeErrors,
+    scan_map: ScanMap, posed: Sequence[Posed], workers: Workers, watch: Stopwatch, errors: RelativeErrors
 ) -> list[Result]:
-    """Localize photos together; `cams_from_bundle` are their poses in any common frame.
+    """Localize photos together; those of all settings but their priors and traces are alike.
 
-    `errors` are those expected of these poses; their scale is unknown if its deviation is large.
+    `errors` are those expected of the poses; their scale is unknown if its deviation is large.
     """
-    means = Means(settings.effort, workers, watch)
-    alone, found = find_members(scan_map, panoramas, settings, means)
-    cams = move_origin_near(cams_from_bundle)
+    shots = [Shot(one.panorama, one.settings, one.trace) for one in posed]
+    alone, found = find_members(scan_map, shots, workers, watch)
+    cams = move_origin_near([one.cam_from_bundle for one in posed])
     members = {k: PosedMember(member.found, member.alone, cams[k]) for k, member in sorted(found.items())}
+    settings = posed[0].settings
     with watch.stage("refine"):
+        means = Means(settings.effort, workers, watch)
         together = judge_members(members, errors, means, settings.min_confidence)
     return [together.get(k, one) for k, one in enumerate(alone)]
 

@@ -17,21 +17,19 @@ from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
-from ..judge.by_others import Shares
+from ..judge.by_others import LOCAL_ERRORS, Shares
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result
 from ..local_features.hypotheses import count_matches
 from ..local_features.matching import merge_matches
 from ..localization.means import Means
-from ..panorama import Panorama
-from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
-from .bundle import EVEN_ODDS, LOCAL_ERRORS, judge_placed, place_between
+from .bundle import EVEN_ODDS, judge_placed, place_between
 from .bundle_search import NUM_BUNDLES, Support, find_support, weigh_bundles
 from .links import FIRM, WEAK, Links, Places, are_bridged, compute_shared, find_links, find_pose, spread
-from .members import Member, find_members
+from .members import Member, Shot, find_members
 
-NUM_LIKELY = 2  # poses of a photo from which a place of the group may follow, the likeliest
+NUM_ANCHORS = 2  # poses of a photo from which a place of the group may follow, the likeliest
 LEAST_LIKELY = 1e-3  # chosen: probability of such a pose
 MOST_SPREAD = 12  # places of the group that are looked at
 BELONGS_WEAKLY = 0.7  # chosen: probability that a photo belongs where few matches put it
@@ -62,24 +60,25 @@ class Grouped(NamedTuple):
 
 @one_blas_thread()
 def localize_group(
-    scan_map: ScanMap,
-    panoramas: Sequence[Panorama],
-    settings: CoarseToFineSettings,
-    workers: Workers,
-    watch: Stopwatch,
+    scan_map: ScanMap, shots: Sequence[Shot], workers: Workers, watch: Stopwatch
 ) -> list[Grouped]:
-    """Localize photos that may belong together, in any order; those that do not are localized alone."""
-    means = Means(settings.effort, workers, watch)
-    contents = [sha256(panorama.rgb.tobytes()).digest() for panorama in panoramas]
-    order = sorted(range(len(panoramas)), key=contents.__getitem__)  # results depend on no other
-    alone, members = find_members(scan_map, [panoramas[k] for k in order], settings, means)
-    with watch.stage("refine"):
-        matched = {k: one for k, one in members.items() if one.found.problem.profile.uses_matches}
-        found = localize_linked(matched, means, settings.min_confidence)
+    """Localize photos that may belong together, in any order; those that do not are localized alone.
+
+    Those of all settings but their priors and traces are alike.
+    """
+    contents = [sha256(shot.panorama.rgb.tobytes()).digest() for shot in shots]
+    order = sorted(range(len(shots)), key=contents.__getitem__)  # results depend on no other
+    alone, members = find_members(scan_map, [shots[k] for k in order], workers, watch)
     grouped = {order[k]: Grouped(one, ()) for k, one in enumerate(alone)}
-    for k, (result, others) in found.items():
-        grouped[order[k]] = Grouped(result, tuple(sorted(order[other] for other in others)))
-    return [grouped[k] for k in range(len(panoramas))]
+    matched = {k: one for k, one in members.items() if one.found.problem.profile.uses_matches}
+    if matched:
+        settings = shots[0].settings
+        with watch.stage("refine"):
+            means = Means(settings.effort, workers, watch)
+            found = localize_linked(matched, means, settings.min_confidence)
+        for k, (result, others) in found.items():
+            grouped[order[k]] = Grouped(result, tuple(sorted(order[other] for other in others)))
+    return [grouped[k] for k in range(len(shots))]
 
 
 def localize_linked(members: Mapping[int, Member], means: Means, min_confidence: float) -> dict[int, Grouped]:
@@ -105,7 +104,7 @@ def propose_places(group: Group, numbers: Collection[int]) -> list[Places]:
     own = [
         (-probability, number, candidate.pose)
         for number in sorted(numbers)
-        for candidate, probability in group.members[number].own_poses[:NUM_LIKELY]
+        for candidate, probability in group.members[number].own_poses[:NUM_ANCHORS]
         if probability > LEAST_LIKELY
     ]
     found: list[Places] = []

@@ -3,7 +3,9 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+from ..jobs.threads import Stopwatch, Workers
 from ..judge.candidate import Candidate
 from ..judge.consensus import MOST_CONFLICT, Consensus
 from ..judge.probability import LOCALIZED
@@ -16,7 +18,7 @@ from ..localization.localize import (
     list_guessed,
     prepare_search,
 )
-from ..localization.means import Means
+from ..localization.means import NO_TRACE, Means, Trace
 from ..panorama import Panorama
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
@@ -46,38 +48,58 @@ class Member:
         return list(zip(self.found.selection.candidates, places, strict=False))
 
 
+class Shot(NamedTuple):
+    """A photo to be found."""
+
+    panorama: Panorama
+    settings: CoarseToFineSettings
+    trace: Trace = NO_TRACE
+
+    @property
+    def camera(self) -> tuple[object, ...]:
+        """All that was given of its camera; photos with the same are of one."""
+        prior = self.panorama.focal_prior
+        if prior is None:
+            return ()
+        camera = self.panorama.cameras[0].camera
+        return camera.width, camera.height, prior.source, prior.focal
+
+
 def find_members(
-    scan_map: ScanMap, panoramas: Sequence[Panorama], settings: CoarseToFineSettings, means: Means
+    scan_map: ScanMap, shots: Sequence[Shot], workers: Workers, watch: Stopwatch
 ) -> tuple[list[Result], dict[int, Member]]:
     """Find each of several photos by itself.
 
-    Those that are not sure are found again with the focal length that those that are sure tell. Returns the
-    result of each photo alone, and those that were searched by their numbers.
+    Those that are not sure are found again with the focal length that those that are sure tell of their
+    camera. Returns the result of each photo alone, and those that were searched by their numbers.
     """
-    alone: list[Result] = [nothing_found() for _ in panoramas]
+    alone = [nothing_found() for _ in shots]
     members: dict[int, Member] = {}
 
-    def find_each(photos: Iterable[tuple[int, Panorama]]) -> None:
-        for k, panorama in photos:
-            member = find_alone(scan_map, panorama, settings, means)
+    def find_each(numbered: Iterable[tuple[int, Shot]]) -> None:
+        for k, shot in numbered:
+            member = find_alone(scan_map, shot, workers, watch)
             if member is None:
-                alone[k] = explain_nothing(scan_map, panorama, settings.prior)
+                alone[k] = explain_nothing(scan_map, shot.panorama, shot.settings.prior)
             else:
                 alone[k] = member.alone
                 members[k] = member
 
-    find_each(enumerate(panoramas))
-    find_each(expect_focal(panoramas, alone).items())
+    find_each(enumerate(shots))
+    for camera in dict.fromkeys(shot.camera for shot in shots):
+        numbers = [k for k, shot in enumerate(shots) if shot.camera == camera]
+        expected = expect_focal([shots[k].panorama for k in numbers], [alone[k] for k in numbers])
+        find_each((numbers[n], shots[numbers[n]]._replace(panorama=one)) for n, one in expected.items())
     return alone, members
 
 
-def find_alone(
-    scan_map: ScanMap, panorama: Panorama, settings: CoarseToFineSettings, means: Means
-) -> Member | None:
+def find_alone(scan_map: ScanMap, shot: Shot, workers: Workers, watch: Stopwatch) -> Member | None:
     """Find a photo by itself, with the best of several guessed focal lengths; None if nothing is searched."""
+    settings = shot.settings
+    means = Means(settings.effort, workers, watch, shot.trace)
     found: list[Member] = []
-    for photo in list_guessed(panorama):
-        problem = prepare_search(scan_map, photo, settings, means.watch)
+    for photo in list_guessed(shot.panorama):
+        problem = prepare_search(scan_map, photo, settings, watch)
         if problem is None:
             return None
         search = find_by_edges if problem.profile.follows_walls else find

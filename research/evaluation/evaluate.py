@@ -24,11 +24,11 @@ from piccolo.cli.command import (
     command,
     option,
 )
-from piccolo.cli.execution import Interruption
 from piccolo.errors import InputError
 from piccolo.files.atomic import check_output, is_stream, write_atomically
 from piccolo.files.line_file import open_locked
 from piccolo.jobs.cluster import Cluster
+from piccolo.jobs.interruption import Interruption, interruptible
 from piccolo.jobs.memory import limit_memory
 from piccolo.jobs.threads import Workers
 from piccolo.judge.result import UNREADABLE
@@ -195,7 +195,7 @@ def run_scenes(
             file.cut(size)
             with (
                 execution.connecting(arguments) as cluster,
-                execution.interruptible() as interruption,
+                interruptible() as interruption,
             ):
                 for scene, queries in left:
                     if not interruption.number:

@@ -1,0 +1,64 @@
+"""Photos of a scan whose poses relative to each other are known, as `Scan.localize_bundle` localizes them."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from .errors import InputError
+from .geometry.pose import Pose
+from .jobs.memory import check_memory
+from .jobs.threads import Stopwatch, Workers
+from .judge.result import Result
+from .localization.localize import has_guessed_focal
+from .localization.means import NO_TRACE, Trace
+from .localization.places import add_places
+from .photo import Photo
+from .photo_reader import PhotoReader
+from .problem.settings import CoarseToFineSettings
+from .scan_map.scan_map import ScanMap
+from .together.bundle import Posed, localize_bundle
+from .together.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
+
+MEMORY_OF_PHOTO = 8e7  # [byte] that a photo keeps while others of its bundle are localized
+
+
+class AskedPosed(NamedTuple):
+    """A photo with its pose in a common frame, and the settings by which it is to be localized."""
+
+    photo: Photo
+    cam_from_bundle: Pose
+    settings: CoarseToFineSettings
+    trace: Trace = NO_TRACE
+
+
+def localize_posed(
+    scan_map: ScanMap,
+    reader: PhotoReader,
+    workers: Workers,
+    asked: Sequence[AskedPosed],
+    relative_scale: RelativeScale,
+) -> list[Result]:
+    """Return the results of photos together.
+
+    Raises InputError for a photo that can't be read, and for a focal length that is a guess.
+    """
+    if not asked:
+        return []
+    watch = Stopwatch()
+    check_memory(len(asked) * MEMORY_OF_PHOTO, f"{len(asked)} photos together", "localize fewer together")
+    taken = [reader.take(one.photo, watch) for one in asked]
+    if any(has_guessed_focal(picture) for picture, _ in taken):
+        raise InputError("`relative_poses`: found a focal length that is a guess, wanted a known one")
+    errors = RelativeErrors()
+    if relative_scale == "unknown":
+        errors = errors._replace(log_scale=UNKNOWN_SCALE)
+    posed = [
+        Posed(picture, one.cam_from_bundle, one.settings, one.trace)
+        for one, (picture, _) in zip(asked, taken, strict=True)
+    ]
+    found = localize_bundle(scan_map, posed, workers, watch, errors)
+    seconds = {stage: spent / len(found) for stage, spent in watch.seconds.items()}
+    results = []
+    for one, (picture, facts), result in zip(asked, taken, found, strict=True):
+        blank = reader.make_blank(one.photo, picture, facts, one.settings, seconds)
+        results.append(add_places(scan_map, result).complete(blank))
+    return results

@@ -1,0 +1,61 @@
+"""Photos of a scan that were taken at one place, as `Scan.localize_together` localizes them."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+from .jobs.memory import check_memory
+from .jobs.threads import Stopwatch, Workers
+from .judge.result import Result
+from .judge.result_parts import Beside
+from .localization.means import NO_TRACE, Trace
+from .localization.places import add_places
+from .panorama import Panorama
+from .panorama.photo import PhotoFacts
+from .photo import Photo
+from .photo_reader import PhotoReader
+from .problem.settings import CoarseToFineSettings
+from .scan_bundle import MEMORY_OF_PHOTO
+from .scan_map.scan_map import ScanMap
+from .together.group import localize_group
+from .together.members import Shot
+from .together.second_looks import digest_of
+
+
+class AskedTogether(NamedTuple):
+    """A photo, and the settings by which it is to be localized."""
+
+    photo: Photo
+    settings: CoarseToFineSettings
+    trace: Trace = NO_TRACE
+
+
+def localize_photos_together(
+    scan_map: ScanMap, reader: PhotoReader, workers: Workers, asked: Sequence[AskedTogether]
+) -> list[Result]:
+    """Return the results of photos, localized together as far as they show the same.
+
+    One that can't be read has a result that says so.
+    """
+    watch = Stopwatch()
+    check_memory(len(asked) * MEMORY_OF_PHOTO, f"{len(asked)} photos together", "localize fewer together")
+    results: dict[int, Result] = {}
+    taken: dict[int, tuple[Panorama, PhotoFacts]] = {}
+    for k, one in enumerate(asked):
+        try:
+            taken[k] = reader.take(one.photo, watch)
+        except Exception as error:
+            results[k] = reader.make_failed(one.photo, error, one.settings)
+    numbers = list(taken)
+    shots = [Shot(taken[k][0], asked[k].settings, asked[k].trace) for k in numbers]
+    found = localize_group(scan_map, shots, workers, watch)
+    seconds = {stage: spent / max(len(numbers), 1) for stage, spent in watch.seconds.items()}
+    for k, (result, _) in zip(numbers, found, strict=True):
+        picture, facts = taken[k]
+        blank = reader.make_blank(asked[k].photo, picture, facts, asked[k].settings, seconds)
+        results[k] = add_places(scan_map, result).complete(blank)
+    every = digest_of([results[k] for k in numbers])
+    for k, (_, others) in zip(numbers, found, strict=True):
+        names = tuple(asked[numbers[other]].photo.name for other in others)
+        results[k] = replace(results[k], beside=Beside(names, every) if names else None)
+    return [results[k] for k in range(len(asked))]

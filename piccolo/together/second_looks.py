@@ -1,0 +1,198 @@
+"""Which photos of a batch get a second look, and what the photos of one camera say together.
+
+Photos that are unsure, or off in focal length, are looked at again with the focal length of the others, and
+then beside those that are sure.
+"""
+
+import json
+import math
+from bisect import bisect
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from hashlib import sha256
+from typing import NamedTuple, TypeVar
+
+from ..evidence.focal_length import WIDE
+from ..judge.conclude import follow_consensus
+from ..judge.consensus import Consensus
+from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
+from ..judge.result import Result
+from ..judge.result_parts import FocalLength
+from ..judge.sure import SURE_CONFIDENCE
+
+MOST_PICTURES = 200  # beside which a photo is looked at again
+BETTER = 0.7  # others' deviation must be below this fraction of the photo's own
+ONE_CAMERA = 1.02  # largest ratio of neighbouring given focal lengths of one camera: focusing changes them
+TOLD_CHANGE = 1e-3  # of a confidence: a smaller one is not written again
+Item = TypeVar("Item")
+
+
+class Look(NamedTuple):
+    """A photo to look at again."""
+
+    number: int  # in the batch
+    pano: str
+    first: Result | None  # without the others; None if that is to be computed again
+    beside: tuple[Result, ...]  # of the photos that are sure
+    asked_sha256: str  # digest of these
+    focal: FocalLength | None = None  # as found so far, with what other photos of the camera say
+
+
+class Change(NamedTuple):
+    """A result that other photos of the batch have changed."""
+
+    number: int  # in the batch
+    before: Result
+    after: Result
+    is_news: bool  # False if only how the photo was looked at has changed, or its confidence
+
+
+def is_doubtful(result: Result) -> bool:
+    """Return True for a photo with `cameras` that is not localized, or was not without others beside it."""
+    was_doubtful = result.beside is not None or result.status in (AMBIGUOUS, NOT_LOCALIZED)
+    return bool(result.cameras) and was_doubtful
+
+
+def may_change(result: Result) -> bool:
+    """Return True if other photos may change a result."""
+    return is_doubtful(result) or result.focal_length is not None
+
+
+def localize_in_order(
+    photos: Sequence[Item],
+    localize: Callable[[Item], Result],
+    look_again: Callable[[Item, Look], Result],
+    min_confidence: float,
+) -> Iterator[Result]:
+    """Yield the results of photos that help each other; those behind one that may change wait for it."""
+    results: list[Result] = []
+    num_told = 0
+    for photo in photos:
+        results.append(localize(photo))
+        if num_told == len(results) - 1 and not may_change(results[-1]):
+            num_told += 1
+            yield results[-1]
+
+    def ask(looks: Sequence[Look]) -> Iterator[Result]:
+        return (look_again(photos[look.number], look) for look in looks)
+
+    for _ in revise(results, ask, min_confidence):
+        pass
+    yield from results[num_told:]
+
+
+def revise(
+    results: list[Result], ask: Callable[[Sequence[Look]], Iterable[Result]], min_confidence: float
+) -> Iterator[Change]:
+    """Change results in their list by what the photos tell each other, and yield each change.
+
+    `ask` returns the results of looks in their order; one with an error changes nothing. If it returns fewer,
+    as the work was interrupted, this ends.
+    """
+    for list_looks in LISTINGS:
+        yield from follow_cameras(results, min_confidence)
+        looks = list_looks(results)
+        num_answers = 0
+        for num_answers, after in enumerate(ask(looks), 1):
+            look = looks[num_answers - 1]
+            if after.error is None:
+                is_news = look.first is None or (after.beside is not None and len(after.beside.photos) > 0)
+                change = Change(look.number, results[look.number], after, is_news)
+                results[look.number] = after
+                yield change
+        if num_answers < len(looks):
+            return
+    yield from follow_cameras(results, min_confidence)
+
+
+def follow_cameras(results: list[Result], min_confidence: float) -> Iterator[Change]:
+    """Change results in their list by what all photos of a camera say, and yield each change.
+
+    Together they may confirm the focal length given, doubt it, or contradict it.
+    """
+    for camera in group_by_camera(results):
+        consensus = Consensus([known.opinion for _, known in camera]).opinion()
+        if consensus is None:
+            continue
+        for k, _ in camera:
+            before = results[k]
+            after = follow_consensus(before, consensus, min_confidence)
+            after = replace(after, warnings=tuple(dict.fromkeys(after.warnings)))
+            is_other = after.status != before.status or after.warnings != before.warnings
+            if is_other or abs(after.confidence - before.confidence) > TOLD_CHANGE:
+                results[k] = after
+                yield Change(k, before, after, after.status != before.status)
+
+
+def list_looks_by_focal(results: Sequence[Result]) -> list[Look]:
+    """List the photos whose focal length others know better, if they are not localized or theirs is off."""
+    looks = []
+    for camera in group_by_camera(results):
+        consensus = Consensus([known.opinion for _, known in camera])
+        for n, (k, focal) in enumerate(camera):
+            others = consensus.opinion(without=n)
+            if others is None or focal.others_px is not None:
+                continue
+            px = focal.given_px * math.exp(others.off)
+            std_px = math.sqrt(others.variance) * px
+            told = replace(focal, others_px=px, others_std_px=std_px)
+            is_off = abs(px - focal.px) > focal.std_px
+            if std_px < BETTER * focal.std_px and (is_off or results[k].status != LOCALIZED):
+                looks.append(Look(k, results[k].pano, None, (), digest_of([]), told))
+    return looks
+
+
+def group_by_camera(results: Sequence[Result]) -> list[list[tuple[int, FocalLength]]]:
+    """Return numbers and focal lengths of photos by camera: of one size, source and about what was given.
+
+    Those whose focal length was a mere guess are left out.
+    """
+    known = [
+        (result.source.image_size or (0, 0), focal.source, focal.given_px, k, focal)
+        for k, result in enumerate(results)
+        if (focal := result.focal_length) is not None and focal.prior_deviation <= WIDE
+    ]
+    groups: list[list[tuple[int, FocalLength]]] = []
+    camera: tuple[object, ...] = ()
+    largest = 0.0
+    for size, source, px, k, focal in sorted(known, key=lambda one: one[:4]):
+        if (size, source) != camera or px > largest:
+            groups.append([])
+        groups[-1].append((k, focal))
+        camera = size, source
+        largest = ONE_CAMERA * px
+    return groups
+
+
+def list_looks_beside(results: Sequence[Result]) -> list[Look]:
+    """List the photos that are not sure, each with others that are.
+
+    These are the nearest in order: what was taken one after another mostly belongs together. A photo that was
+    looked at beside the same photos is done.
+    """
+    sure = [
+        k
+        for k, result in enumerate(results)
+        if result.status == LOCALIZED and result.confidence >= SURE_CONFIDENCE and result.beside is None
+    ]
+    looks = []
+    for k, result in enumerate(results):
+        if not is_doubtful(result):
+            continue
+        place = bisect(sure, k)
+        around = sure[max(place - MOST_PICTURES, 0) : place + MOST_PICTURES]
+        near = [results[n] for n in sorted(sorted(around, key=lambda n: abs(n - k))[:MOST_PICTURES])]
+        asked = digest_of(near)
+        if asked != (result.beside.asked_sha256 if result.beside else digest_of([])):
+            first = None if result.beside and result.beside.photos else result
+            looks.append(Look(k, result.pano, first, tuple(near), asked, result.focal_length))
+    return looks
+
+
+LISTINGS = (list_looks_by_focal, list_looks_beside)  # in their order
+
+
+def digest_of(results: Sequence[Result]) -> str:
+    """Return a digest of photos: of their paths and contents."""
+    photos = [(result.pano, result.source.pano_sha256) for result in results]
+    return sha256(json.dumps(photos).encode()).hexdigest()

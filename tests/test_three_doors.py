@@ -1,0 +1,114 @@
+"""Command line, Python and service say the same of the same photos, to the bit."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rooms
+from pictures import encoded, write
+from poses import result
+from services import serving
+from test_focal_length import DENSE, TRUE
+from test_localize_cameras import SEED, place
+
+import piccolo
+from piccolo.batch.relative_poses import read_relative_poses
+from piccolo.camera import Mount
+from piccolo.camera.model import pinhole
+from piccolo.cli.localize import main
+from piccolo.export.formats import export
+from piccolo.export.posed_images import Options
+from piccolo.geometry.pose import Pose, yaw_rotation
+from piccolo.jobs.threads import Workers
+from research.synthetic.world import render_picture
+
+FOCAL = 1.03 * TRUE  # as it is told, 3 % too long
+NUM_PHOTOS = 4
+COLOR = "photo {}.png"
+
+
+def _untimed(text):
+    """A result as a dictionary, but for its times."""
+    return json.loads(text) | {"seconds": None}
+
+
+def _lines(path):
+    return [_untimed(line) for line in path.read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    """Narrow photos of one camera, one after another."""
+    folder = tmp_path_factory.mktemp("doors")
+    room, pose = place(1)
+    for k in range(NUM_PHOTOS):
+        turned = yaw_rotation(0.5 * k) @ pose.R_cam_from_world
+        taken = Pose(turned, pose.center_world + np.array([0.02 * k, 0.03, 0.0]))
+        picture = render_picture(Mount(pinhole(320, 240, TRUE)), room, taken, Workers(2))
+        write(folder / f"{k}.png", encoded(picture, ".png"))
+    return sorted(folder.iterdir())
+
+
+def test_photos_of_one_camera(photos, tmp_path):
+    """Three say together what their focal length is; the fourth is looked at again beside them."""
+    cloud = str(rooms.map_path(SEED, DENSE))
+    out = tmp_path / "poses.jsonl"
+    near = (*place(1)[1].center_world.tolist(), 1.0)
+    words = ["--cloud", cloud, "--pano", *map(str, photos), "--focal", str(FOCAL), "--gravity", "known"]
+    main([*words, "--near", *map(str, near), "--quiet", "--out", str(out)])
+    expected = _lines(out)
+    assert [line["beside"] is None for line in expected] == [True, True, True, False]
+    scan = piccolo.open_scan(cloud)
+    prior = piccolo.Prior(near=near[:3], radius=near[3])
+    given = [piccolo.Photo(str(photo), focal_px=FOCAL) for photo in photos]
+    found = scan.localize_many(given, prior=prior, gravity="known")
+    assert [_untimed(r.to_json()) for r in found] == expected
+    (alone,) = scan.localize_many(iter(given[:1]), prior=prior, gravity="known")
+    told = expected[0]["focal_length"]["doubt"]
+    assert alone.focal_length.doubt != told, "of an iterator each is localized by itself"
+    pictures = {photo.name: photo.read_bytes() for photo in photos}
+    prior = {"near": near[:3], "radius": near[3]}
+    options = {"photo": {"focal_px": FOCAL}, "prior": prior, "gravity": "known"}
+    with serving("--cloud", cloud, "--jobs", "1") as client:
+        status, _, body = client.post_all("/localize", pictures, options)
+    assert status == 200
+    answers = list(map(_untimed, body.decode().splitlines()))
+    for answer, line in zip(answers, expected, strict=True):
+        beside = line["beside"] and answer["beside"] | {
+            "photos": [str(photos[0].parent / name) for name in answer["beside"]["photos"]],
+            "asked_sha256": line["beside"]["asked_sha256"],  # of the names, too
+        }
+        assert answer | {"pano": line["pano"], "beside": beside} == line
+
+
+def test_a_bundle_a_walk_and_a_colouring(tmp_path):
+    cloud = rooms.write_cloud(tmp_path / "scan.ply", 1, 60_000)
+    queries = [rooms.query(1, index=k, width=512) for k in range(2)]
+    paths = [str(tmp_path / COLOR.format(k)) for k in range(2)]
+    for path, query in zip(paths, queries, strict=True):
+        write(Path(path), encoded(query.rgb, ".png"))
+    words = ["--cloud", cloud, "--cache", str(tmp_path / "maps"), "--gravity", "known", "--pano", *paths]
+    scan = piccolo.open_scan(cloud, cache=tmp_path / "maps")
+
+    def run(name, *more):
+        out = tmp_path / f"{name}.jsonl"
+        main([*words, *more, "--quiet", "--out", str(out)])
+        return _lines(out)
+
+    poses = [query.pose for query in queries]
+    taken = [result(path, pose) for path, pose in zip(paths, poses, strict=True)]
+    export(taken, "nerfstudio", tmp_path / "poses.json", Options(size=(512, 256)))
+    by_file = run("bundle", "--relative", str(tmp_path / "poses.json"))
+    relative = read_relative_poses(tmp_path / "poses.json", [Path(path) for path in paths])
+    bundled = [_untimed(r.to_json()) for r in scan.localize_bundle(paths, relative, gravity="known")]
+    for line in by_file:
+        assert len(line["settings"].pop("relative_sha256")) == 64
+    assert by_file == bundled
+    walked = [_untimed(r.to_json()) for r in scan.localize_walk(paths, [0.0, 1.0], gravity="known")]
+    assert run("walk", "--walk", "--times", "names") == walked
+    color = tmp_path / "colored.ply"
+    found = scan.color(paths, tmp_path / "own.ply", gravity="known")
+    assert run("color", "--color-scan", str(color)) == [_untimed(r.to_json()) for r in found.results]
+    assert (tmp_path / "own.ply").read_bytes() == color.read_bytes()
+    assert 0 < found.num_colored <= found.num_points
