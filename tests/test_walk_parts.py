@@ -25,7 +25,7 @@ from piccolo.judge.result_parts import Alternative, Evidence
 from piccolo.photo import Photo
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.together.walk.frames import MOST_ODDS, Frame, State, list_states
-from piccolo.together.walk.path import Ranked
+from piccolo.together.walk.path import NOTHING, Ranked
 from piccolo.together.walk.results import check_odometry, make_localization, smooth_positions
 
 MAX_ACCELERATION = 0.5  # [m/s^2]
@@ -159,6 +159,16 @@ def test_a_frame_of_a_walk_is_believed_by_its_path_and_its_errors(std):
     assert found.belief.place[-1] == pytest.approx(0.03)
     assert (found.status == "localized") == (std == 0.01)
     assert len(found.alternatives) == 5
+
+
+def test_a_frame_that_is_sure_beyond_reach_of_the_walk_is_told_but_not_believed():
+    tracker = SimpleNamespace(settings=CoarseToFineSettings())
+    sure = _judged(make_belief([0.98, 0.01]))
+    told = make_localization(tracker, Frame(0.0, alone=sure), NOTHING)
+    assert (told.status, told.pose) == ("not_localized", sure.pose)
+    assert told.confidence == pytest.approx(0.49)
+    unsure = replace(sure, status="ambiguous")
+    assert make_localization(tracker, Frame(0.0, alone=unsure), NOTHING) is unsure
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

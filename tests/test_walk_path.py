@@ -10,7 +10,10 @@ from refusals import assert_input_error
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, carry, exp_so3, pose_errors, yaw_rotation
-from piccolo.together.walk import path as walk_path, results
+from piccolo.jobs.threads import no_progress
+from piccolo.judge.result import Result
+from piccolo.problem.settings import CoarseToFineSettings
+from piccolo.together.walk import path as walk_path, second_look
 from piccolo.together.walk.frames import JUMP_LOG, MOST_EXPECTED, Frame, Motion, State, check_times
 from piccolo.together.walk.path import NOTHING, Ranked, believe
 from piccolo.together.walk.tracker import Followed, expect
@@ -293,10 +296,10 @@ def walk():
 
     def find(problem, frame, near):
         expected = expect(frame, [(frames[k], pose) for k, pose in near], Motion())
-        return results.find_near(problem, expected, None)
+        return second_look.find_near(problem, expected, None)
 
     about = {"find": find, "problem_of": lambda k: k, "means": None}
-    tracker = SimpleNamespace(frames=frames, motion=Motion(), **about)
+    tracker = SimpleNamespace(frames=frames, motion=Motion(), settings=CoarseToFineSettings(), **about)
     return tracker, walk_path.Path(probabilities, [None] * len(frames)), beliefs
 
 
@@ -308,9 +311,9 @@ def _find(walk, monkeypatch, x, how="near", is_alone=True):
         asked.append(expected)
         return Followed(State(_at(x), 5.0, 0.5), how, is_alone)
 
-    monkeypatch.setattr(results, "find_near", find)
+    monkeypatch.setattr(second_look, "find_near", find)
     tracker, path, beliefs = walk
-    results._find_lost(tracker, path, beliefs, LOST)
+    second_look._find_lost(tracker, path, beliefs, LOST)
     return tracker.frames[LOST], asked
 
 
@@ -366,4 +369,74 @@ def test_rough_places_are_refined_if_they_leave_another_unsure(probabilities, is
     states = [State(_at(5.0 * k), 1.0, 0.5 if r else None) for k, r in enumerate(is_refined)]
     tracker = SimpleNamespace(frames=[Frame(0.0, states, is_key=True)])
     path = walk_path.Path([np.array(probabilities)], [None])
-    assert results._list_rough(tracker, path, 0) == listed
+    assert second_look._list_rough(tracker, path, 0) == listed
+
+
+def test_frames_that_are_not_sure_are_searched_some_of_each_run():
+    sure, unsure = Ranked([State(_at(0.0), 8.0, 0.5)], np.array([0.99])), NOTHING
+    frames = [Frame(float(k)) for k in range(60)]
+    beliefs = [unsure] * 2 + [sure] + [unsure] * 57
+    assert second_look.list_unsure(frames, beliefs, 0.9) == [0, 1, *range(5, 60, 5)]
+    frames[1].alone = Result()
+    assert second_look.list_unsure(frames, beliefs, 0.9)[:2] == [0, 5]
+    assert second_look.list_unsure(frames[:3], [sure] * 3, 0.999) == [0, 2]
+
+
+@pytest.mark.parametrize(
+    ("x", "is_sure", "is_tracked", "is_taken"),
+    [
+        (10.1, True, True, True),
+        (10.1, False, True, False),
+        (10.1, False, False, True),
+        (30.0, True, False, False),
+    ],
+)
+def test_a_frame_that_is_sure_alone_joins_the_walk_if_it_is_within_reach(
+    walk, x, is_sure, is_tracked, is_taken
+):
+    tracker, _, beliefs = walk
+    before = tracker.frames[LOST]
+    before.states = [State(_at(10.2), 1.0, 0.5)] if is_tracked else []
+    alone = Result("localized" if is_sure else "ambiguous")
+
+    def search(problem, frame):
+        frame.alone = alone
+        frame.states = [State(_at(x), 4.0, 0.5)]
+        frame.is_key = True
+
+    tracker.search = search
+    assert second_look._search_unsure(tracker, beliefs, no_progress) == is_taken
+    assert tracker.frames[LOST].is_key == is_taken
+    assert tracker.frames[LOST].alone is alone
+    assert (tracker.frames[LOST] is before) != is_taken
+
+
+def test_a_pose_that_found_a_frame_before_stays_if_it_is_likelier(walk, monkeypatch):
+    tracker, path, beliefs = walk
+    tracker.frames[LOST] = _followed(TIMES[LOST], 1, (10, 0, 0), 2.0)
+    beliefs[LOST] = believe(tracker.frames, path, LOST)
+    assert 0.8 < beliefs[LOST].confidence < 0.9
+    before = tracker.frames[LOST]
+
+    def find_worse(problem, frame, near):
+        return Followed(State(_at(10.1), 1.0, 0.5), "tracked", True)
+
+    tracker.find = find_worse
+    second_look._find_lost(tracker, path, beliefs, LOST)
+    assert tracker.frames[LOST] is before
+
+
+def test_doubtful_frames_that_look_elsewhere_add_up():
+    """Each is right with 0.83 by itself; the photos were tracked from each other."""
+    frames = [_key(float(k), ((k, 0, 0), 1.6), ((40 + k, 9 * k, 0), -6.0)) for k in range(4)]
+    for k, frame in enumerate(frames[1:]):
+        frame.key, frame.arrived = k, frame.states[0].pose
+    sure = [
+        walk_path.build_lattice(frames[:n], Open(), Motion(max_speed=1.0, is_timed=False)).smooth()
+        for n in range(1, 5)
+    ]
+    first = [path.probabilities[0][0] for path in sure]
+    assert first[0] == pytest.approx(0.83, abs=0.01)
+    assert first[1] > 0.95
+    assert first == sorted(first)
+    assert first[3] > 0.98

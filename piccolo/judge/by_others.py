@@ -1,5 +1,6 @@
 """Changes of the belief in a photo by photos that help it."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -10,6 +11,13 @@ from ..arrays import Array
 from .belief import Belief, make_belief
 
 LEAST_NONE = 1e-6
+MISSED = 0.25  # chosen: of photos, those without a right pose found (of BENCHMARK.md's phone photos a sixth)
+LOCAL_ERRORS = np.diag(np.repeat([math.radians(2.0) ** 2, 0.15**2], 3))  # chosen: of local optima, [rad, m]
+
+
+def local_share(odds: float) -> float:
+    """Return the probability that a photo's own pose is a local optimum near the right one, by its odds."""
+    return MISSED / (1.0 + odds)
 
 
 class Shares(NamedTuple):

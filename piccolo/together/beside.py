@@ -131,10 +131,22 @@ def list_agreeing(
     own = scan_map.from_world(judged.best_pose)
     agreeing = []
     for other, turned in zip(found, matches, strict=True):
-        exact = exact_pose(turned, own)
-        if exact and exact.num_matches >= method.sure_matches and CONFIRMED.holds(exact.pose, own):
-            agreeing.append(other._replace(matches=turned, pose=exact.pose))
+        exact = confirm(turned, own, method.sure_matches)
+        if exact:
+            agreeing.append(other._replace(matches=turned, pose=exact))
     return agreeing
+
+
+def confirm(matches: Matches, own: Pose, least: int) -> Pose | None:
+    """Return a photo's pose by its matches with another; None if fewer than `least` confirm its own."""
+    exact = exact_pose(matches, own)
+    is_confirmed = exact and exact.num_matches >= least and CONFIRMED.holds(exact.pose, own)
+    return exact.pose if exact and is_confirmed else None
+
+
+def attach_by_matches(of_other: PoseGaussian, pose: Pose, matches: Matches) -> PoseGaussian:
+    """Return a photo's pose by its matches with another photo, with the errors of that photo's pose."""
+    return of_other.attach(pose @ of_other.pose.inverse(), match_covariance(matches, pose))
 
 
 def fuse(judged: Result, other: Neighbor, ended: Found) -> PoseGaussian | None:
@@ -147,8 +159,7 @@ def fuse(judged: Result, other: Neighbor, ended: Found) -> PoseGaussian | None:
     of_photo = other.picture.gaussian
     if own is None or of_photo is None or judged.belief.ruled_out:
         return None
-    other_from_cam = other.pose @ of_photo.pose.inverse()
-    expected = of_photo.attach(other_from_cam, match_covariance(other.matches, other.pose))
+    expected = attach_by_matches(of_photo, other.pose, other.matches)
     if ended.fit is not None:
         expected = expected.widen(ended.fit.pose_covariance)
     return fuse_allowed(ended.problem, expected, own)

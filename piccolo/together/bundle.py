@@ -20,7 +20,7 @@ from ..evidence.focal_length import FocalFit
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_within, subtract
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
-from ..judge.by_others import Shares, believe_together
+from ..judge.by_others import LOCAL_ERRORS, Shares, believe_together
 from ..judge.candidate import Selection
 from ..judge.consensus import MOST_CONFLICT, Consensus
 from ..judge.probability import LOCALIZED
@@ -53,7 +53,6 @@ from .bundle_search import (
 )
 
 EVEN_ODDS = 0.5
-LOCAL_ERRORS = np.diag(np.repeat([math.radians(2.0) ** 2, 0.15**2], 3))  # chosen: of local optima, [rad, m]
 NUM_EXCHANGED = 8  # chosen: photos whose relative pose another may have by mistake
 MOST_GAIN = 3.0  # [log] by being where it was to be expected
 TOLD = 2.0  # deviations of the scale, and ratio of other errors to those expected, that are reported

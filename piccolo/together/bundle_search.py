@@ -16,7 +16,7 @@ from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose, angle_between
 from ..geometry.pose_gaussian import PoseGaussian
 from ..jobs.threads import Workers
-from ..judge.by_others import LEAST_NONE
+from ..judge.by_others import LEAST_NONE, MISSED, local_share
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Errors
 from ..judge.consensus import MOST_CONFLICT
@@ -30,7 +30,6 @@ from ..problem.problem import Problem
 from ..problem.stages import FINE
 from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
 
-MISSED = 0.25  # chosen: of photos, those without a right pose found (of BENCHMARK.md's phone photos a sixth)
 MOST_UNSEEN = 1.0 / 3.0  # chosen: of photos, those that may show nothing
 SILENT = 0.05  # chosen: of photos of the bundle, those that show nothing of their place
 CHANCE_NEAR = 0.02  # chosen: probability that a photo has a pose near that by a wrong pose of the bundle
@@ -93,7 +92,7 @@ class Support(NamedTuple):
     @property
     def local_share(self) -> float:
         """Probability that the own pose is a local optimum near the right one."""
-        return MISSED / (1.0 + self.odds)
+        return local_share(self.odds)
 
     @property
     def shares(self) -> Array:

@@ -10,6 +10,7 @@ from ...geometry.pose import Pose, carry, exp_so3, log_so3
 from .frames import MOST_EXPECTED, Frame, How, Motion, State
 from .path import COPY_LOG_ODDS
 
+NUM_NARROW = 4  # chosen: places within reach from which a narrow photo is tracked
 Place = tuple[Pose, float]  # in the map, as rough as the grid of candidates; log odds against the frame's own
 
 
@@ -19,6 +20,10 @@ class Expected(NamedTuple):
     last: Pose  # of the other frame, moved by the odometry if there is one
     reach: float  # [m] from there
     pose: Pose  # predicted
+
+    def is_within(self, pose: Pose) -> bool:
+        """Return True for a pose within reach."""
+        return pose.distance(self.last) <= self.reach
 
 
 class Start(NamedTuple):
@@ -65,15 +70,19 @@ def predict(last: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pos
 def list_alike(expected: Expected, places: Sequence[Place]) -> list[Pose]:
     """Return the places within reach that look hardly worse than the best one, as copies do."""
     alike = [pose for pose, behind in places if behind > -COPY_LOG_ODDS]
-    return [pose for pose in alike if pose.distance(expected.last) <= expected.reach]
+    return [pose for pose in alike if expected.is_within(pose)]
 
 
-def list_starts(expected: Expected, behind: float, alike: Sequence[Pose], is_narrow: bool) -> list[Start]:
+def list_starts(
+    expected: Expected, behind: float, alike: Sequence[Pose], is_narrow: bool, told: Sequence[Pose] = ()
+) -> list[Start]:
     """Return from where a frame is tracked, in order, until an end holds.
 
-    `behind` are the odds [log] by which the expected pose looks worse than the best place.
+    `behind` are the odds [log] by which the expected pose looks worse than the best place. A narrow photo,
+    of which views tell little, has more starts, of which `told` are those by other evidence.
     """
-    best = [Start(pose, False) for pose in alike[:1]]
+    others = [*filter(expected.is_within, told), *alike[:NUM_NARROW]] if is_narrow else alike[:1]
+    best = [Start(pose, False) for pose in others]
     if behind > -COPY_LOG_ODDS:
         return [Start(expected.pose, False), *best]
     return [*best, Start(expected.pose, True)] if is_narrow else best
@@ -83,7 +92,7 @@ def is_acceptable(state: State, expected: Expected, must_be_sure: bool) -> bool:
     """Return True for a pose within reach that is sure by itself or, if it need not be, was expected."""
     is_expected = not must_be_sure and ONE_PLACE.holds(state.pose, expected.pose)
     is_sure = state.log_odds >= MOST_EXPECTED or is_expected
-    return is_sure and state.pose.distance(expected.last) <= expected.reach
+    return is_sure and expected.is_within(state.pose)
 
 
 def describe_end(end: State, expected: Expected, alike: Sequence[Pose]) -> Followed:

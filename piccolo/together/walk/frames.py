@@ -18,7 +18,7 @@ from ...arrays import Array
 from ...errors import InputError
 from ...geometry.nearness import ONE_ANSWER
 from ...geometry.pose import Pose
-from ...geometry.pose_gaussian import PoseGaussian
+from ...geometry.pose_gaussian import PoseGaussian, probability_within
 from ...judge.candidate import Candidate
 from ...judge.probability import LOCALIZED
 from ...judge.result import Result
@@ -48,6 +48,11 @@ class State:
     def is_refined(self) -> bool:
         """True if the pose is as good as that of a photo alone."""
         return self.score is not None
+
+    @property
+    def within(self) -> float:
+        """Probability that the pose is within 0.1 m, if its place is right."""
+        return probability_within(self.gaussian)
 
 
 @dataclass

@@ -20,6 +20,7 @@ from ...arrays import Array, Mask
 from ...geometry.nearness import ONE_ANSWER
 from ...geometry.pose import Pose, carry
 from ...judge.result_parts import Gap
+from ...judge.sure import SURE_ODDS
 from ...scan_map.camera_positions import FreeSpace
 from .frames import JUMP_LOG, MOST_EXPECTED, MOST_ODDS, REACH_SLACK, Frame, Motion, State, state_centers
 
@@ -284,6 +285,16 @@ class Ranked(NamedTuple):
     def is_sure(self) -> bool:
         """True if the first pose more likely is right than not."""
         return len(self.states) > 0 and self.states[0].is_refined and bool(self.probabilities[0] > EVEN)
+
+    @property
+    def is_confirmed(self) -> bool:
+        """True if the first pose is sure by its photo alone, or was found where others expect it."""
+        return any(state.gain > 0.0 or state.log_odds >= SURE_ODDS for state in self.states[:1])
+
+    @property
+    def confidence(self) -> float:
+        """Probability of the first pose; 0 if there is none."""
+        return float(self.probabilities[0]) * self.states[0].within if self.states else 0.0
 
 
 NOTHING = Ranked([], np.empty(0))

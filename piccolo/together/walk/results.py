@@ -1,24 +1,17 @@
-"""The results of a walk's frames, when all of them are known.
-
-A second look tracks and refines what the frames after a frame tell; positions are smoothed by small
-accelerations.
-"""
+"""The results of a walk's frames, when all of them are known; positions are smoothed by accelerations."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
-from itertools import islice, pairwise
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from ...arguments import MIN_CONFIDENCE
 from ...arrays import Array
 from ...evidence.contradictions import contradictions
-from ...geometry.pose import Pose, carry
-from ...geometry.pose_gaussian import PoseGaussian, add, probability_within
-from ...jobs.threads import Progress, no_progress, one_blas_thread
+from ...geometry.pose_gaussian import PoseGaussian, add
+from ...jobs.threads import Progress, no_progress
 from ...judge.alternatives import MAX_ALTERNATIVES
 from ...judge.belief import make_belief
 from ...judge.conclude import take_pose
@@ -28,16 +21,14 @@ from ...judge.probability import LOCALIZED
 from ...judge.reasons import explain
 from ...judge.result import Result, nothing_found
 from ...judge.result_parts import Alone, Alternative, Gap, WalkFrame
-from ...problem.problem import Problem
-from .expectation import Expected, Followed
 from .frames import Frame
-from .path import EVEN, Path, Ranked, believe, build_lattice
-from .tracker import Tracker, find_near, refine_state
+from .path import EVEN, Ranked
+from .second_look import finish
+from .tracker import Tracker
 
 LEAST_WALKED = 2.0  # [m] between frames by which an odometry is checked
 LEAST_RATIOS = 4  # of distances; fewer say nothing
 TOLD_SCALE = 0.03  # error of an odometry's scale that is reported
-Find = Callable[[Problem], Followed | None]
 
 
 def make_localizations(tracker: Tracker, show: Progress = no_progress) -> list[tuple[Result, WalkFrame]]:
@@ -96,14 +87,17 @@ def describe_frame(frames: Sequence[Frame], k: int, gap: Gap | None) -> WalkFram
 def make_localization(tracker: Tracker, frame: Frame, ranked: Ranked) -> Result:
     """Make a frame's result from its poses and the probabilities that the walk gives them."""
     if not ranked.states:
-        return frame.alone or nothing_found()
+        found = frame.alone or nothing_found()
+        is_beyond = found.status == LOCALIZED  # reach of the others: it contradicts them
+        least = tracker.settings.min_confidence
+        return found.take_belief(found.belief.scale(EVEN), least) if is_beyond else found
     best, *others = ranked.states
     others = others[:MAX_ALTERNATIVES]
     scan_map = tracker.scan_map
-    is_own = frame.alone and frame.states and best is frame.states[0]
+    is_own = best.is_refined and best.end is None  # as only the search ends
     own = frame.alone if is_own and frame.alone else nothing_found()
     contradicted = contradictions(scan_map, best.pose, tracker.settings.prior)
-    belief = make_belief(ranked.probabilities[: 1 + len(others)], probability_within(best.gaussian))
+    belief = make_belief(ranked.probabilities[: 1 + len(others)], best.within)
     described = Result(
         best_pose=scan_map.to_world(best.pose),
         loss=own.loss,
@@ -175,118 +169,3 @@ def move_pose(located: PoseGaussian, move: Array, variance: Array) -> PoseGaussi
     own[3:, 3:] = variance
     pose = add(located.pose, np.concatenate([gain @ move, move]))
     return PoseGaussian(pose, 0.5 * (own + own.T), located.common)
-
-
-@one_blas_thread()
-def finish(tracker: Tracker, show: Progress) -> tuple[Path, list[Ranked]]:
-    """Find the path of all frames of a tracker, and what each may be.
-
-    The likely places of key frames are refined, frames that were tracked elsewhere are tracked there, and
-    lost ones are looked for from sure ones.
-    """
-    num = len(tracker.frames)
-    path = _refine_likely(tracker, show)
-    beliefs = [believe(tracker.frames, path, k) for k in range(num)]
-    for k in show(iter(range(num)[::-1]), num, "look for lost frames"):
-        _find_lost(tracker, path, beliefs, k)
-    path = _refine_likely(tracker, show)
-    return path, [believe(tracker.frames, path, k) for k in range(num)]
-
-
-def _refine_likely(tracker: Tracker, show: Progress) -> Path:
-    """Refine the likely places of all key frames, until the path needs no others; return it."""
-    space = tracker.lattice.space
-    lattice = build_lattice(tracker.frames, space, tracker.motion)
-    path = lattice.smooth()
-    while rough := [k for k in range(len(tracker.frames)) if _list_rough(tracker, path, k)]:
-        for k in show(iter(rough), len(rough), "refine"):
-            _refine(tracker, path, k)
-        lattice = build_lattice(tracker.frames, space, tracker.motion, lattice)
-        path = lattice.smooth()
-    return path
-
-
-def _list_rough(tracker: Tracker, path: Path, k: int) -> list[int]:
-    """List the rough states of a frame that are likely, or that together may leave the best unsure."""
-    found = path.probabilities[k]
-    states = tracker.frames[k].states if len(found) else []
-    rough = sorted((j for j, state in enumerate(states) if not state.is_refined), key=lambda j: -found[j])
-    left = np.cumsum(found[rough][::-1])[::-1]  # with those that are less likely
-    limit = 1.0 - MIN_CONFIDENCE  # with less in all, the best stays sure
-    return [
-        j
-        for j, total in zip(rough, left, strict=True)
-        if found[j] > limit or j == path.choose(k) or (total > limit and found.max() > EVEN)
-    ]
-
-
-def _refine(tracker: Tracker, path: Path, k: int) -> None:
-    """Refine the likely places of a key frame."""
-    frame = tracker.frames[k]
-    problem = tracker.problem_of(k)
-    for rough in [frame.states[j] for j in _list_rough(tracker, path, k)]:
-        if problem is None:
-            frame.states = [state for state in frame.states if state is not rough]
-        else:
-            frame.states = refine_state(problem, frame.states, rough, tracker.workers)
-
-
-def _find_lost(tracker: Tracker, path: Path, beliefs: list[Ranked], k: int) -> None:
-    """Track a frame that is not sure from where it is to be expected, or look for it near sure ones."""
-    frames = tracker.frames
-    ways = _list_ways(tracker, beliefs, k)
-    problem = tracker.problem_of(k) if ways else None
-    if problem is None:
-        return
-    for begin, find in ways:
-        found = find(problem)
-        if found is None or not _is_walked(tracker, beliefs, k, found.state.pose):
-            continue
-        if found.is_alone or found.how == "tracked":
-            _hang(frames, path, k, begin, found)
-            beliefs[k] = believe(frames, path, k)
-            return
-
-
-def _is_walked(tracker: Tracker, beliefs: Sequence[Ranked], k: int, pose: Pose) -> bool:
-    """Return True if a frame's pose is within reach of the nearest sure frames."""
-    frames = tracker.frames
-    nearest = [side[0] for side in _list_sure(frames, beliefs, k)]
-    reaches = [tracker.motion.reach(frames[k].time - frames[m].time) for m in nearest]
-    distances = [pose.distance(beliefs[m].states[0].pose) for m in nearest]
-    return all(d <= reach for d, reach in zip(distances, reaches, strict=True))
-
-
-def _list_ways(tracker: Tracker, beliefs: Sequence[Ranked], k: int) -> list[tuple[int, Find]]:
-    """List the frames from which a frame may be found, and how."""
-    frame = tracker.frames[k]
-    belief = beliefs[k]
-    ways: list[tuple[int, Find]] = []
-    if frame.key is not None and belief.expected is not None:
-        expected = Expected(belief.expected, tracker.motion.reach(0.0), belief.expected)
-        ways = [(frame.key, partial(find_near, expected=expected, means=tracker.means))]
-    if not belief.is_sure and (sides := _list_sure(tracker.frames, beliefs, k)):
-        near = [(m, beliefs[m].states[0].pose) for m in sides[0]]
-        ways.append((sides[0][0], partial(tracker.find, frame=frame, near=near)))
-    return ways
-
-
-def _list_sure(frames: Sequence[Frame], beliefs: Sequence[Ranked], k: int) -> list[list[int]]:
-    """List the two nearest sure frames after and before a frame, the side that is nearer in time first."""
-    ways = range(k + 1, len(frames)), range(k - 1, -1, -1)
-    sides = [list(islice((m for m in way if beliefs[m].is_sure), 2)) for way in ways]
-    return sorted(filter(None, sides), key=lambda side: abs(frames[side[0]].time - frames[k].time))
-
-
-def _hang(frames: list[Frame], path: Path, k: int, sure: int, found: Followed) -> None:
-    """Give a frame a pose beside a sure one, whose key frame is then its key frame too."""
-    key = sure if frames[sure].is_key else frames[sure].key
-    chosen = None if key is None else path.choose(key)
-    if key is None or chosen is None:
-        return
-    at_key = frames[key].states[chosen].pose
-    departed = frames[key].departed = frames[key].departed or at_key
-    arrived = carry(found.state.pose, at_key, departed)
-    frames[k] = replace(
-        frames[k], states=[found.state], how=found.how, is_key=False, key=key, arrived=arrived, departed=None
-    )
