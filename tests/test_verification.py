@@ -175,7 +175,7 @@ def test_a_copy_of_its_place_that_is_likelier_becomes_the_best(is_copy):
     found = make_selection(examine(problem, off), examine(problem, here))
     means = rooms.means()
     judged = judge(Found(problem, found, None), means, 0.9)
-    best = problem.scan_map.from_world(judged.pose)
+    best = problem.scan_map.from_world(judged.best_pose)
     assert best.distance(here if is_copy else off) < 0.1
     assert len(judged.alternatives) == 1
     assert len(means.trace.steps[-1]["candidates"]) == 2
