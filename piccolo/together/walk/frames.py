@@ -22,6 +22,7 @@ from ...geometry.pose_gaussian import PoseGaussian, probability_within
 from ...judge.candidate import Candidate
 from ...judge.probability import LOCALIZED
 from ...judge.result import Result
+from ...judge.sure import SURE_ODDS
 from ...scan_map.camera_positions import COARSE_SPACING
 from ...scan_map.scan_map import ScanMap
 
@@ -50,6 +51,11 @@ class State:
         return self.score is not None
 
     @property
+    def is_sure(self) -> bool:
+        """True if the photo is sure of the pose, by itself or by a frame beside that confirms it."""
+        return self.log_odds + self.gain >= SURE_ODDS
+
+    @property
     def within(self) -> float:
         """Probability that the pose is within 0.1 m, if its place is right."""
         return probability_within(self.gaussian)
@@ -73,6 +79,11 @@ class Frame:
     def log_odds(self) -> float:
         """Log odds that any of the frame's poses is right."""
         return max((state.log_odds for state in self.states), default=-math.inf)
+
+    @property
+    def is_sure(self) -> bool:
+        """True if it is sure of any of its poses, at the place from which it was tracked."""
+        return any(state.is_sure for state in self.states)
 
     @property
     def tracking_pose(self) -> Pose | None:

@@ -20,7 +20,6 @@ from ...arrays import Array, Mask
 from ...geometry.nearness import ONE_ANSWER
 from ...geometry.pose import Pose, carry
 from ...judge.result_parts import Gap
-from ...judge.sure import SURE_ODDS
 from ...scan_map.camera_positions import FreeSpace
 from .frames import JUMP_LOG, MOST_EXPECTED, MOST_ODDS, REACH_SLACK, Frame, Motion, State, state_centers
 
@@ -288,8 +287,8 @@ class Ranked(NamedTuple):
 
     @property
     def is_confirmed(self) -> bool:
-        """True if the first pose is sure by its photo alone, or was found where others expect it."""
-        return any(state.gain > 0.0 or state.log_odds >= SURE_ODDS for state in self.states[:1])
+        """True if the photo is sure of the first pose, by itself or by a frame beside."""
+        return any(state.is_sure for state in self.states[:1])
 
     @property
     def confidence(self) -> float:

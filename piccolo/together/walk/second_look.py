@@ -43,8 +43,13 @@ def _settle(tracker: Tracker, show: Progress) -> tuple[Path, list[Ranked]]:
     num = len(tracker.frames)
     path = _refine_likely(tracker, show)
     beliefs = [believe(tracker.frames, path, k) for k in range(num)]
-    for k in show(iter(range(num)[::-1]), num, "look for lost frames"):
-        _find_lost(tracker, path, beliefs, k)
+    both_ways = [*range(num)[::-1], *range(num)]  # what confirms a frame may do so for the next
+    asked: dict[int, list[Pose]] = {}
+    for k in show(iter(both_ways), len(both_ways), "look for lost frames"):
+        near = [beliefs[m].states[0].pose for side in _list_sure(tracker.frames, beliefs, k) for m in side]
+        if near != asked.get(k):
+            _find_lost(tracker, path, beliefs, k)
+            asked[k] = near
     path = _refine_likely(tracker, show)
     return path, [believe(tracker.frames, path, k) for k in range(num)]
 

@@ -10,7 +10,6 @@ from ...geometry.nearness import ONE_PLACE, RIGHT
 from ...geometry.pose import Pose
 from ...geometry.pose_gaussian import PoseGaussian
 from ...jobs.threads import Stopwatch, Workers, one_blas_thread
-from ...judge.sure import SURE_ODDS
 from ...localization.attempts import can_look_first
 from ...localization.localize import localize
 from ...localization.means import Means
@@ -160,7 +159,7 @@ class Tracker:
         """
         of_others: Sequence[PoseGaussian | None] = ()
         if problem.profile.is_narrow:
-            sure = [(k, pose) for k, pose in near if self.frames[k].log_odds >= SURE_ODDS]
+            sure = [(k, pose) for k, pose in near if self.frames[k].is_sure]
             others = [(k, other, pose) for k, pose in sure if (other := self.problem_of(k))]
             located = (place_keypoints(other, pose, self.workers) for _, other, pose in others)
             beside = tuple(match_beside(problem, one, self.workers) for one in located)
