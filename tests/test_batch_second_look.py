@@ -38,7 +38,7 @@ from piccolo.photo import Photo
 from piccolo.result_files import read_results
 from piccolo.scan import Scan
 from piccolo.second_look import Looking
-from piccolo.together.second_looks import MOST_PICTURES, Look, list_looks_beside
+from piccolo.together.second_looks import MOST_PICTURES, Look, list_looks_beside, localize_in_order
 from research.synthetic.world import render_picture
 
 PHONE = (Mount(pinhole(1024, 512, 400.0)),)
@@ -128,6 +128,27 @@ def test_lines_on_a_stream_keep_their_order_and_wait_for_one_that_may_change():
             assert [one.pano for one in output.results()] == ["0", "surer", "2"]
         output.close()
         assert written == ([texts[0], surer, texts[2]] if may_change else texts)
+
+
+def test_results_come_in_order_and_wait_for_one_that_may_change():
+    statuses = ("localized", "ambiguous", "localized")
+    asked = []
+
+    def localize(k):
+        asked.append(k)
+        return _result(f"{k}", statuses[k])
+
+    def look_again(k, look):
+        assert [one.pano for one in look.beside] == ["0", "2"]
+        return replace(look.first, status="localized", beside=Beside(("0",), look.asked_sha256))
+
+    found = localize_in_order(range(3), localize, look_again, 0.9)
+    assert next(found).pano == "0"
+    assert asked == [0]
+    second, third = found
+    assert asked == [0, 1, 2]
+    assert (second.pano, second.status, second.beside.photos) == ("1", "localized", ("0",))
+    assert third == _result("2")
 
 
 @pytest.fixture

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 import rooms
 from batches import untimed
+from refusals import assert_input_error
 from scans import read_cloud
 from scipy.spatial import cKDTree
 
+import piccolo
 from piccolo.batch.jobs import steps_file
 from piccolo.cli import color_scan as tool, localize as command_line
 from piccolo.cloud.octree import build_octree, recolor
@@ -357,6 +359,18 @@ def test_a_colouring_that_is_stopped_twice_goes_on_with_the_same_bits(
     assert untimed(out.with_suffix(".jsonl")) == untimed(whole.with_suffix(".jsonl"))
     assert out.with_suffix(".ply").read_bytes() == whole.with_suffix(".ply").read_bytes()
     assert not steps_file(out.with_suffix(".jsonl")).exists()
+
+
+def test_colouring_from_python_says_what_is_missing(files, tmp_path):
+    cloud, photos = files
+    scan = piccolo.open_scan(cloud[1], cache=cloud[3])
+    out = tmp_path / "colored.ply"
+    found = scan.color(photos[:1], out, gravity="known")
+    assert ([r.status for r in found.results], found.num_points) == (["localized"], 0)
+    assert not out.exists()
+    assert_input_error("`photos`: found an array", scan.color, [np.zeros((8, 16, 3), np.uint8)], out)
+    assert_input_error("wanted a name that ends with", scan.color, photos, tmp_path / "a.xyz")
+    assert_input_error("^room: found no files of points", rooms.scan(SEED).color, photos, out)
 
 
 @pytest.mark.parametrize(
