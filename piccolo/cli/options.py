@@ -167,6 +167,8 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
         "a transforms.json (nerfstudio, phone apps), TUM trajectory or table with the photos' names as times"
     )
     option(group, "--relative FILE", text)
+    text = "the photos were taken at one place or on a short way, such as by a phone that is turned around: "
+    option(group, "--together", text + "those that show the same are localized together, in any order")
     text = "the photos are frames of one walk, in this order, and constrain each other"
     option(group, "--walk", text)
     option(group, "--video FILE ...", "video of a walk, or its chapters in order, instead of --pano")

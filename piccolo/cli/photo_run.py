@@ -51,7 +51,7 @@ LEFT_HANDED = (
     "the photos fit the scan mirrored, left for right: its axes are left-handed, which `up` can't mend; "
     "negate one of its coordinates, or export it with right-handed axes"
 )
-JOINT = ("walk", "video", "relative", "color_scan")  # options of photos that help each other
+JOINT = ("walk", "video", "relative", "together", "color_scan")  # options of photos that help each other
 Write = Callable[[str], object]
 
 
@@ -341,8 +341,7 @@ def run_jointly(run: Run) -> int:
             asked = together.ask_for_walk(arguments, frames, scan, motion, steps_of)
         else:
             scan = open_scan(run, localizer, arguments.threads or num_cores())
-            ask = together.ask_for_bundle if arguments.relative else together.ask_for_coloring
-            asked = ask(arguments, photos, localizer, scan, steps_of)
+            asked = together.choose_job(arguments)(arguments, photos, localizer, scan, steps_of)
         stack.enter_context(tracing(run))
 
         def write(photo: Photo, result: Result) -> None:

@@ -16,6 +16,7 @@ from ..batch.jobs import (
     WriteSteps,
     make_bundle_job,
     make_coloring_job,
+    make_group_job,
     make_walk_job,
     run_job,
     steps_file,
@@ -40,7 +41,8 @@ from .options import DEFAULT_EVERY
 
 KNOWN = "their camera must be known: refine it with a single photo"
 IN_TURN = "its frames come one after another"
-AS_ONE = "its photos are weighed as one camera, in one process"
+AS_ONE = "its photos are weighed together, in one process"
+NO_COLORS = "labels are no colours"
 IN_ROUNDS = "a photo needs the colours of all others"
 OTHER = "photos are localized together in one way"
 NOT_WITH: Mapping[str, Mapping[str, str]] = {  # options that do not go with what is asked for, and why
@@ -52,13 +54,15 @@ NOT_WITH: Mapping[str, Mapping[str, str]] = {  # options that do not go with wha
         "refine_focal": KNOWN,
     },
     "--relative": {"walk": OTHER, "video": OTHER, "jobs": AS_ONE, "dask": AS_ONE, "refine_focal": KNOWN},
+    "--together": {"walk": OTHER, "relative": OTHER, "jobs": AS_ONE, "dask": AS_ONE, "labels": NO_COLORS},
     "--color-scan": {
         "walk": OTHER,
         "video": OTHER,
         "relative": OTHER,
+        "together": OTHER,
         "jobs": IN_ROUNDS,
         "dask": IN_ROUNDS,
-        "labels": "labels are no colours",
+        "labels": NO_COLORS,
     },
 }
 ONLY_WITH_WALKS = ("times", "max_speed", "odometry")
@@ -78,8 +82,8 @@ def check_joint_options(arguments: Arguments) -> None:
     elif bool(a.video) == bool(a.pano):
         raise UsageError("--walk, --video: wanted --walk with --pano, or --video alone")
     refuse_others(a)
-    if (a.walk or a.color_scan) and is_from_stdin(a.pano):
-        option = "--walk" if a.walk else "--color-scan"
+    if (a.walk or a.together or a.color_scan) and is_from_stdin(a.pano):
+        option = "--walk" if a.walk else "--together" if a.together else "--color-scan"
         raise UsageError(f"{option}: found names on stdin, wanted files or folders")
     if a.color_scan:
         color_scan.check_suffix(a.color_scan)
@@ -90,7 +94,7 @@ def refuse_others(arguments: Arguments) -> None:
     """Refuse options that do not go with what is asked for, and say why."""
     a = arguments
     asked = {"a video": a.video, "a walk": a.walk or a.video, "--relative": a.relative}
-    asked["--color-scan"] = a.color_scan
+    asked |= {"--together": a.together, "--color-scan": a.color_scan}
     for what in (what for what, is_asked in asked.items() if is_asked):
         for name, why in NOT_WITH[what].items():
             a.refuse_given((name,), f"not with {what}: {why}")
@@ -145,6 +149,20 @@ def ask_for_bundle(
     return Printed(make_bundle_job(localizer, scan, photos, arguments.relative, write_steps), report)
 
 
+def ask_for_group(
+    arguments: Arguments, photos: Sequence[Path], localizer: Localizer, scan: Scan, write_steps: WriteSteps
+) -> Printed:
+    """Return the job of --together."""
+
+    def report(results: Sequence[Result]) -> tuple[str, bool]:
+        for result in results:
+            print_result(arguments, result, result.warnings[len(scan.warnings) :])
+        num_together = sum(result.beside is not None for result in results)
+        return f"; {num_together} of them by others too", True
+
+    return Printed(make_group_job(localizer, scan, photos, write_steps), report)
+
+
 def ask_for_coloring(
     arguments: Arguments, photos: Sequence[Path], localizer: Localizer, scan: Scan, write_steps: WriteSteps
 ) -> Printed:
@@ -166,6 +184,13 @@ def ask_for_coloring(
         return f"; {part:.0f} % of the points coloured", True
 
     return Printed(make_coloring_job(localizer, scan, photos, out, write_steps), report)
+
+
+def choose_job(arguments: Arguments) -> Callable[..., Printed]:
+    """Return the function that makes the job that is asked for, of photos that are no frames."""
+    if arguments.relative:
+        return ask_for_bundle
+    return ask_for_group if arguments.together else ask_for_coloring
 
 
 @contextmanager
