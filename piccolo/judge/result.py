@@ -81,7 +81,8 @@ class Result:
     walk
         For a frame of a walk, how its pose was found. Status, pose and covariance are then those of the walk.
     beside
-        For a photo that was not sure alone, the photos of the batch beside which it was looked at again.
+        For a photo that was not sure alone, the photos of the batch beside which it was looked at again; of
+        photos of one place, those that it was localized with.
     seconds
         Time [s] spent on this photo, by stage.
     settings, warnings

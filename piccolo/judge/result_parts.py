@@ -96,7 +96,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Beside:
-    """A second look at a photo, beside others of a batch."""
+    """A second look at a photo, beside others of a batch; or those that it was localized together with."""
 
     photos: tuple[str, ...]  # paths of those that show the same, those with the most matches first
     asked_sha256: str  # digest of all that were asked

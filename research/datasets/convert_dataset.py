@@ -55,7 +55,7 @@ example:
   python tools/convert_dataset.py stanford2d3ds --from data/stanford --out scenes --areas 1 3 --check 3
 
 Writes OUT/SCENE/cloud.ply, images/ (links to the dataset's files, or copies), labels/ and queries.json.
-docs/DATASETS.md describes them, and the folders and poses of each dataset. An existing scene is not changed.
+research/DATASETS.md describes them, and the folders and poses of each dataset. A scene that exists is left..
 A scene with a damaged file is left out and named on stderr. Prints one JSON object per scene.
 """
 MIN_SCORE = 0.1  # other views of the same place may have as much, but seldom more than the right one

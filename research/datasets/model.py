@@ -105,7 +105,7 @@ class SceneList(NamedTuple):
 def scene_list(folder: Path, specs: Sequence[SceneSpec], missing: Sequence[str], layout: str) -> SceneList:
     """Return the scenes found in a folder, InputError if none; and a note on those that miss a cloud."""
     if not specs:
-        raise InputError(f"{folder}: found no {layout}, wanted the layout in docs/DATASETS.md")
+        raise InputError(f"{folder}: found no {layout}, wanted the layout in research/DATASETS.md")
     notes = (f"{len(missing)} scenes without a cloud: {', '.join(missing)}",) if missing else ()
     return SceneList(tuple(specs), notes)
 

@@ -1,4 +1,4 @@
-"""Data sets of papers: their folders and files of poses. docs/DATASETS.md has the sources."""
+"""Data sets of papers: their folders and files of poses. research/DATASETS.md has the sources."""
 
 import json
 import math

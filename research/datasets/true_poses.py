@@ -25,7 +25,7 @@ file that tools/align_gravity.py has written beside an aligned cloud of one scen
 
 def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
-    option(parser, "--scenes FOLDER ...", "scenes with true poses (docs/DATASETS.md)", required=True)
+    option(parser, "--scenes FOLDER ...", "scenes with true poses (research/DATASETS.md)", required=True)
     option(parser, "--transform FILE", "write the queries.json of a scene under this transform")
     option(parser, "--metres-per-unit X", "unit of the transform's translation [m]", default=1.0)
     option(parser, "--out FILE", "JSON lines; with --transform a queries.json", required=True)

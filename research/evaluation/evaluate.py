@@ -47,7 +47,7 @@ examples:
   python tools/evaluate.py --scenes room --results poses.jsonl
   python tools/evaluate.py --compare paper.jsonl run.jsonl
 
-Scenes are folders with a queries.json, a cloud and images, at any depth below --scenes (docs/DATASETS.md).
+Scenes are folders with a queries.json, a cloud and images, anywhere below --scenes (research/DATASETS.md).
 --out localizes the queries that the run lacks, and appends a line for each: repeat the command to resume a
 stopped run. --results are lines of localize.py instead; each belongs to the query with the same path, or else
 with the same file name. Tables are Markdown on stdout (on stderr if one of the files is stdout).
