@@ -1,22 +1,22 @@
 """The work of a batch: in this process, several, or a cluster, until a signal ends it."""
 
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from tqdm import tqdm
 
-from ..batch.localizer import Answer, Localizer, Task
+from ..batch.answering import Executor
+from ..batch.localizer import Localizer
 from ..errors import InputError, printable
 from ..evidence.focal_length import WIDE
 from ..jobs.cluster import Cluster, connect
 from ..jobs.interruption import SIGNALS, Interruption
 from ..jobs.memory import GB, memory_left, memory_taken
-from ..jobs.processes import Here, Processes, WorkerLostError
+from ..jobs.processes import Here, Processes
 from ..jobs.threads import num_cores
 from ..judge.probability import AMBIGUOUS, LOCALIZED
 from ..judge.result import FAILED, UNREADABLE, Result
@@ -31,7 +31,6 @@ from .start import for_terminal
 
 EXIT_SOME_NOT = 1
 QUERY_MEMORY = 0.5e9  # [byte] of a process beside the map
-Executor = Here | Processes | Cluster
 
 
 def choose_exit_code(statuses: Collection[str]) -> int:
@@ -170,22 +169,3 @@ def stop(interruption: Interruption, arguments: Arguments, done: str, is_kept: b
     how = f"{same} continues from here" if is_kept else f"with --out FILE {same} would continue"
     text = f"ended by {SIGNALS[interruption.number]} after {done}; {how}"
     return arguments.error(text, 128 + interruption.number)
-
-
-def answer_all(
-    executor: Executor,
-    localizer: Localizer,
-    tasks: Iterator[Task],
-    show: Callable[[Iterable[Any]], Iterable[Any]] = iter,
-    interruption: Interruption | None = None,
-    cloud_sha256: str | None = None,
-) -> Iterator[Answer]:
-    """Yield the answers to tasks in order, after a signal those that are done; `show` wraps the tasks."""
-    values = executor.values(tasks)
-    pairs = show(values)
-    for task, wait in interruption.each(pairs, values.take_finished()) if interruption else pairs:
-        try:
-            answer = wait()
-        except WorkerLostError as error:
-            answer = localizer.give_up(task, error, cloud_sha256)
-        yield answer

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..arguments import PICTURES
+from ..batch.answering import Answering
 from ..batch.inputs import describe_left_out, is_from_stdin, list_panoramas, read_priors
 from ..batch.localizer import Answer, Localizer
 from ..batch.results_file import FileOutput, Output, Records, StreamOutput
@@ -36,11 +37,10 @@ from ..problem.settings import CoarseToFineSettings
 from ..scan import Scan
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
-from ..together.second_looks import LISTINGS, Change, Look, follow_cameras, revise
+from ..together.second_looks import LISTINGS, Change, follow_cameras
 from ..views.pictures import encode_image
 from . import execution, terminal, together
 from .command import Arguments, UsageError, check_distinct, check_suffix, checking_options
-from .execution import Executor
 from .options import check_arguments
 from .settings import localizer_from
 
@@ -222,7 +222,7 @@ def tracing(run: Run) -> Iterator[None]:
 
 
 def localize_all(
-    run: Run, records: Records, left: Iterable[Path], executor: Executor, write: Write
+    run: Run, records: Records, left: Iterable[Path], answering: Answering, write: Write
 ) -> Interruption:
     """Localize the panoramas that are left, write each result as it comes, until a signal ends it."""
     is_one = run.total == 1
@@ -232,7 +232,7 @@ def localize_all(
     tasks = map(run.localizer.task, left)
     with interruptible() as interruption:
         signals = None if is_one else interruption
-        for answer in execution.answer_all(executor, run.localizer, tasks, show, signals, run.cloud_sha256):
+        for answer in answering.answer_all(tasks, show, signals):
             record(run, answer, write)
     return interruption
 
@@ -253,32 +253,21 @@ def follow_all_cameras(run: Run, results: list[Result], output: Output) -> None:
         record_change(run, change, Answer(change.after, change.after.warnings), output)
 
 
-def look_again(run: Run, executor: Executor, output: Output) -> Interruption:
+def look_again(run: Run, answering: Answering, output: Output) -> Interruption:
     """Look again at photos, with what others say of their camera, then beside others, until a signal."""
-    localizer = run.localizer
-    answered: dict[int, Answer] = {}
+
+    def show(looks: Iterable[Any], total: int) -> Iterable[Any]:
+        bar: dict[str, Any] = {"desc": "second look", "total": total, "unit": ""}
+        return terminal.show_progress(looks, run.arguments.quiet, **bar)
+
     with interruptible() as interruption:
-
-        def ask(looks: Sequence[Look]) -> Iterator[Result]:
-            if interruption.number:
-                return
-            tasks = (localizer.task(Path(look.pano))._replace(look=look) for look in looks)
-            bar: dict[str, Any] = {"desc": "second look", "total": len(looks), "unit": ""}
-            show = partial(terminal.show_progress, is_quiet=run.arguments.quiet, **bar)
-            answers = execution.answer_all(executor, localizer, tasks, show, interruption, run.cloud_sha256)
-            for look, answer in zip(looks, answers, strict=False):
-                if answer.result.error is not None:
-                    run.arguments.error(answer.result.error)
-                answered[look.number] = answer
-                yield answer.result
-
-        for change in revise(output.results(), ask, localizer.settings.min_confidence):
-            answer = answered.pop(change.number, None) or Answer(change.after, change.after.warnings)
+        looked = answering.look_again(output.results(), show, interruption, run.arguments.error)
+        for change, answer in looked:
             record_change(run, change, answer, output)
     return interruption
 
 
-def note_left_handed(run: Run, records: Records, executor: Executor, interruption: Interruption) -> None:
+def note_left_handed(run: Run, records: Records, answering: Answering, interruption: Interruption) -> None:
     """Say so if no photo was localized, but most of the first spheres are when they are mirrored."""
     is_over = interruption.number or run.counts[LOCALIZED] or records.counts[LOCALIZED]
     if is_over or run.arguments.quiet or len(run.doubtful) < NUM_MIRRORED:
@@ -292,7 +281,7 @@ def note_left_handed(run: Run, records: Records, executor: Executor, interruptio
             panorama = read_panorama(photo_asked, localizer.cloud_settings.labels)
             shown = np.dstack([panorama.rgb, np.uint8(255) * panorama.is_valid])
             path.write_bytes(encode_image(shown[:, ::-1], ".png"))
-        answers = execution.answer_all(executor, localizer, map(localizer.task, paths))
+        answers = answering.answer_all(map(localizer.task, paths))
         found = [answer.result.status for answer in answers]
         if 2 * found.count(LOCALIZED) >= NUM_MIRRORED:
             run.arguments.note(LEFT_HANDED)
@@ -369,6 +358,8 @@ def localize_photos(arguments: Arguments) -> int:
             left = iter(known)
             num_left = len(known)
         first = next(left, None)
+        if isinstance(output, FileOutput):
+            output.begin()
         results = output.results() if first is None and run.looks_again else []
         follow_all_cameras(run, results, output)
         looks = [look for list_looks in LISTINGS for look in list_looks(results)]
@@ -384,11 +375,10 @@ def localize_photos(arguments: Arguments) -> int:
             watch.stage("all"),
         ):
             executor, run.localizer = place
-            if isinstance(output, FileOutput):
-                output.begin()
+            answering = Answering(executor, run.localizer, run.cloud_sha256)
             rest = itertools.chain([first] if first else [], left)
-            interruption = localize_all(run, records, rest, executor, output.write)
+            interruption = localize_all(run, records, rest, answering, output.write)
             if run.looks_again and not interruption.number:
-                interruption = look_again(run, executor, output)
-            note_left_handed(run, records, executor, interruption)
+                interruption = look_again(run, answering, output)
+            note_left_handed(run, records, answering, interruption)
         return finish(run, records, output, interruption, watch.seconds["all"])

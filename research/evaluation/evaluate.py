@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from piccolo.batch.answering import Answering
 from piccolo.batch.localizer import Localizer
 from piccolo.cli import execution, options, settings as cli_settings
 from piccolo.cli.command import (
@@ -250,7 +251,7 @@ def localize_queries(
         def shown(values: Iterable[Any]) -> Iterator[Any]:
             return show(iter(values), len(queries), scene.name)
 
-        answers = execution.answer_all(executor, localizer, tasks, shown, interruption)
+        answers = Answering(executor, localizer).answer_all(tasks, shown, interruption)
         for query, is_inside, (result, *_) in zip(queries, are_inside, answers, strict=False):
             if result.error is None or (result.status == UNREADABLE and not query.is_answerable):
                 in_box = None if result.error else is_inside
