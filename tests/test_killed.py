@@ -44,7 +44,9 @@ def _wait_for_step(process, out, num_lines):
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize(("kind", "num_lines"), [("photos", 1), ("walk", 2), ("relative", 0), ("color", 4)])
+@pytest.mark.parametrize(
+    ("kind", "num_lines"), [("photos", 1), ("walk", 2), ("relative", 0), ("together", 0), ("color", 4)]
+)
 def test_a_job_that_is_killed_goes_on(scene, tmp_path, kind, num_lines):
     folder, words = scene
 
@@ -54,6 +56,7 @@ def test_a_job_that_is_killed_goes_on(scene, tmp_path, kind, num_lines):
             "photos": [],
             "walk": ["--walk", "--times", "names"],
             "relative": ["--relative", str(folder / "relative.json")],
+            "together": ["--together"],
             "color": ["--color-scan", str(colored)],
         }[kind]
         return [*words, *more, "--out", str(tmp_path / f"{name}.jsonl")], tmp_path / f"{name}.jsonl", colored
