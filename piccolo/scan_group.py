@@ -21,6 +21,8 @@ from .together.group import localize_group
 from .together.members import Shot
 from .together.second_looks import digest_of
 
+OF_RESULTS = {"together": True}  # in their settings
+
 
 class AskedTogether(NamedTuple):
     """A photo, and the settings by which it is to be localized."""
@@ -45,7 +47,8 @@ def localize_photos_together(
         try:
             taken[k] = reader.take(one.photo, watch)
         except Exception as error:
-            results[k] = reader.make_failed(one.photo, error, one.settings)
+            failed = reader.make_failed(one.photo, error, one.settings)
+            results[k] = replace(failed, settings={**failed.settings, **OF_RESULTS})
     numbers = list(taken)
     shots = [Shot(taken[k][0], asked[k].settings, asked[k].trace) for k in numbers]
     found = localize_group(scan_map, shots, workers, watch)
@@ -53,6 +56,7 @@ def localize_photos_together(
     for k, (result, _) in zip(numbers, found, strict=True):
         picture, facts = taken[k]
         blank = reader.make_blank(asked[k].photo, picture, facts, asked[k].settings, seconds)
+        blank = replace(blank, settings={**blank.settings, **OF_RESULTS})
         results[k] = add_places(scan_map, result).complete(blank)
     every = digest_of([results[k] for k in numbers])
     for k, (_, others) in zip(numbers, found, strict=True):

@@ -145,13 +145,3 @@ TURNS = {
     7: lambda image: np.swapaxes(np.rot90(image, 2), 0, 1),
     8: np.rot90,
 }
-
-
-def cut_pinhole(sphere, width, height, focal):
-    """The picture (height, width, 3) that a pinhole looking ahead takes of a sphere (H, 2 H, 3)."""
-    across, up = np.meshgrid(0.5 * width - 0.5 - np.arange(width), 0.5 * height - 0.5 - np.arange(height))
-    rays = np.stack([np.full(up.shape, focal), across, up], axis=-1)
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    rows = (0.5 - np.arcsin(rays[..., 2]) / np.pi) * sphere.shape[0] - 0.5
-    columns = (0.5 - np.arctan2(rays[..., 1], rays[..., 0]) / (2.0 * np.pi)) * sphere.shape[1] - 0.5
-    return cv2.remap(sphere, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR)

@@ -79,7 +79,7 @@ def test_what_photos_show_in_common_is_told_by_their_keypoints(turned_deg, least
 
 
 @functools.lru_cache
-def _taken():
+def taken_photos():
     """Photos with their true poses."""
     offsets = {k: np.random.default_rng(int(10 * k)).uniform(-0.2, 0.2, 3) for k in TURN}
     return rooms.take_photos(SEED, 75.0, offsets, 1024)
@@ -87,12 +87,14 @@ def _taken():
 
 @functools.lru_cache
 def _problems():
-    return {k: rooms.ask(photo, rooms.scan_map(SEED), rooms.KNOWN) for k, (photo, _) in enumerate(_taken())}
+    return {
+        k: rooms.ask(photo, rooms.scan_map(SEED), rooms.KNOWN) for k, (photo, _) in enumerate(taken_photos())
+    }
 
 
 def test_poses_of_photos_follow_from_one_by_the_depth_of_the_scan():
     links = find_links(_problems(), rooms.WORKERS)
-    poses = [pose for _, pose in _taken()]
+    poses = [pose for _, pose in taken_photos()]
     anchor = {1: links.place(1, rooms.scan_map(SEED).from_world(poses[1]))}
     places = spread(links, anchor, links.problems, FIRM)
     assert sorted(places) == [0, 1, 2]
@@ -105,7 +107,7 @@ def test_poses_of_photos_follow_from_one_by_the_depth_of_the_scan():
 
 
 def test_a_mirrored_photo_is_linked_with_none():
-    photo = _taken()[1][0]
+    photo = taken_photos()[1][0]
     mirrored = replace(photo, rgb=photo.rgb[:, ::-1], is_valid=photo.is_valid[:, ::-1])
     problems = {**_problems(), 1: rooms.ask(mirrored, rooms.scan_map(SEED), rooms.KNOWN)}
     assert find_links(problems, rooms.WORKERS).list_linked(1) == []
@@ -118,11 +120,11 @@ def _together(photos, num_threads=2):
 
 @functools.lru_cache
 def _localized():
-    return _together([photo for photo, _ in _taken()])
+    return _together([photo for photo, _ in taken_photos()])
 
 
 def test_photos_that_are_not_sure_alone_are_together():
-    photos, poses = zip(*_taken(), strict=True)
+    photos, poses = zip(*taken_photos(), strict=True)
     alone = rooms.locate(photos[1], rooms.scan_map(SEED), rooms.KNOWN)
     assert alone.status == "ambiguous"
     for number, (found, others) in enumerate(_localized()):
@@ -139,12 +141,12 @@ def _bits(found):
 
 
 def test_the_same_bits_in_any_order_and_at_any_number_of_threads():
-    photos = [photo for photo, _ in _taken()]
+    photos = [photo for photo, _ in taken_photos()]
     assert _bits(_together(photos[::-1], 1))[::-1] == _bits(_localized())
 
 
 def test_a_stranger_and_a_photo_that_shows_nothing_stay_alone():
-    photos = [photo for photo, _ in _taken()]
+    photos = [photo for photo, _ in taken_photos()]
     ((stranger, _),) = rooms.take_photos(6, 60.0, {1: [0.0, 0.0, 0.0]})
     nothing = Panorama(photos[0].rgb, np.zeros_like(photos[0].is_valid))
     *right, other, empty = _together([*photos, stranger, nothing])

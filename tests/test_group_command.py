@@ -3,16 +3,20 @@
 import json
 import math
 
-import cv2
 import numpy as np
 import pytest
 import rooms
-from pictures import cut_pinhole
-from test_group import SEED, TURN
+from pictures import encoded, write
+from services import serving
+from test_group import SEED, taken_photos
 
+from piccolo.camera import Mount
+from piccolo.camera.model import pinhole
 from piccolo.cli.localize import main
+from piccolo.opening import open_scan
 from piccolo.photo import Photo
 from piccolo.result_files import read_results
+from research.synthetic.world import render_picture
 
 SIZE = (320, 240)
 FOCAL = 0.5 * SIZE[0] / math.tan(math.radians(37.5))
@@ -22,14 +26,19 @@ FOCAL = 0.5 * SIZE[0] / math.tan(math.radians(37.5))
 def folder(tmp_path_factory):
     """Photos that overlap, one of them mirrored under another name, and a file that is no photo."""
     made = tmp_path_factory.mktemp("a phone")
-    offsets = {k: np.random.default_rng(int(10 * k)).uniform(-0.2, 0.2, 3) for k in TURN}
-    for k, (taken, _) in enumerate(rooms.take_photos(SEED, 360.0, offsets, 1024)):
-        picture = cut_pinhole(taken.rgb, *SIZE, FOCAL)
-        cv2.imwrite(str(made / f"{k}.png"), picture[..., ::-1])
+    camera = Mount(pinhole(*SIZE, FOCAL))
+    for k, (_, pose) in enumerate(taken_photos()):
+        picture = render_picture(camera, rooms.room(SEED)[0].rooms[0], pose, rooms.WORKERS)
+        write(made / f"{k}.png", encoded(picture, ".png"))
         if k == 0:
-            cv2.imwrite(str(made / "mirrored.png"), picture[:, ::-1, ::-1])
+            write(made / "mirrored.png", encoded(np.ascontiguousarray(picture[:, ::-1]), ".png"))
     (made / "broken.png").write_bytes(b"no photo")
     return made
+
+
+def untimed_line(text):
+    """A result as a dictionary, but for its times."""
+    return json.loads(text) | {"seconds": None}
 
 
 def _command(folder, *options):
@@ -67,12 +76,24 @@ def test_photos_of_a_folder_are_localized_together_and_named(folder, tmp_path, c
     steps = [json.loads(line) for line in trace.read_text().splitlines()]
     assert {step["pano"].rpartition("/")[2] for step in steps} == {"0.png", "1.png", "2.png", "mirrored.png"}
 
-    scan = rooms.scan(SEED)
-    three = list(by_name.values())[:3]
-    photos = [Photo(result.pano, focal_px=FOCAL) for result in three]
-    for one, other in zip(scan.localize_together(photos, gravity="known"), three, strict=True):
-        assert (one.status, one.confidence) == (other.status, other.confidence)
-        assert one.best_pose == other.best_pose
+    lines = [untimed_line(result.to_json()) for result in by_name.values()]
+    photos = [Photo(result.pano, focal_px=FOCAL) for result in by_name.values()]
+    scan = open_scan(rooms.map_path(SEED))
+    assert [untimed_line(r.to_json()) for r in scan.localize_together(photos, gravity="known")] == lines
+    pictures = {name: (folder / name).read_bytes() for name in by_name}
+    asked = {"photo": {"focal_px": FOCAL}, "gravity": "known", "together": True}
+    with serving("--cloud", rooms.map_path(SEED), "--jobs", "1") as client:
+        status, _, body = client.post_all("/localize", pictures, asked)
+        assert client.post_all("/localize", pictures, asked | {"together": "yes"})[0] == 400
+    assert status == 200
+    for answer, line in zip(map(untimed_line, body.decode().splitlines()), lines, strict=True):
+        assert answer["pano"] == line["pano"].rpartition("/")[2]
+        assert answer["error"] == (line["error"] and line["error"].replace(f"{folder}/", ""))
+        assert (answer["beside"] is None) == (line["beside"] is None)
+        own = {"pano", "error", "beside"}
+        assert {k: v for k, v in answer.items() if k not in own} == {
+            k: v for k, v in line.items() if k not in own
+        }
 
 
 @pytest.mark.parametrize("options", [["--walk"], ["--relative", "poses.txt"], ["--jobs", "2"], ["--labels"]])

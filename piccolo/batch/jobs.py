@@ -27,7 +27,7 @@ from ..problem.settings import CoarseToFineSettings
 from ..result_files import read_results
 from ..scan import Scan
 from ..scan_bundle import AskedPosed, localize_posed
-from ..scan_group import AskedTogether, localize_photos_together
+from ..scan_group import OF_RESULTS, AskedTogether, localize_photos_together
 from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
 from .localizer import Localizer
@@ -128,7 +128,6 @@ def make_bundle_job(
 
 def make_group_job(localizer: Localizer, scan: Scan, photos: Sequence[Path], write_steps: WriteSteps) -> Job:
     """Return the job of localizing photos of one place together; it has no steps."""
-    more = {"together": True}
     asked = [localizer.ask(path) for path in photos]
     traces = [Trace(localizer.is_traced) for _ in photos]
 
@@ -142,9 +141,9 @@ def make_group_job(localizer: Localizer, scan: Scan, photos: Sequence[Path], wri
         results = localize_photos_together(scan_map, scan.reader, scan.workers, together)
         for result, trace in zip(results, traces, strict=True):
             write_steps(result.pano, trace.steps)
-        return [replace(result, settings={**result.settings, **more}) for result in results]
+        return results
 
-    fields = localizer.expect(scan.prepared.scan_sha256, more)
+    fields = localizer.expect(scan.prepared.scan_sha256, OF_RESULTS)
     return Job("photos together", {photo.name: photo for photo, _ in asked}, fields, run)
 
 

@@ -1,6 +1,7 @@
 """Answers to the photos of a batch, in this process or where else the scan is opened."""
 
 import json
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ from ..photo import Photo, Vector
 from ..photo_reader import Settings, settings_json, unreadable_result
 from ..problem.settings import CoarseToFineSettings
 from ..scan import Scan
+from ..scan_group import AskedTogether, localize_photos_together
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
 from ..scan_photo import Asked
@@ -59,6 +61,17 @@ class Task(NamedTuple):
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             write_temporary(path, content)
+
+
+def rename(result: Result, folder: str) -> Result:
+    """Return a result without the path of a temporary folder in the names of photos."""
+    beside = result.beside
+    if beside is not None:
+        beside = replace(beside, photos=tuple(name.removeprefix(folder) for name in beside.photos))
+    warnings = tuple(warning.replace(folder, "") for warning in result.warnings)
+    error = result.error and result.error.replace(folder, "")
+    pano = result.pano.removeprefix(folder)
+    return replace(result, pano=pano, beside=beside, warnings=warnings, error=error)
 
 
 def files_of(pano: Path) -> dict[str, bytes]:
@@ -186,7 +199,7 @@ class Localizer:
         photo = replace(photo, picture=self.folder / photo.path)
         return scan.place_keypoints(Asked(photo, settings), result)
 
-    def answer_together(self, scan: Scan, tasks: Sequence[Task]) -> list[Result]:
+    def answer_in_order(self, scan: Scan, tasks: Sequence[Task]) -> list[Result]:
         """Localize photos that were sent together, of the same options, and help each other."""
         with temporary_folder() as folder:
             for task in tasks:
@@ -199,6 +212,20 @@ class Localizer:
                 return answer(task._replace(files=None, look=look)).result
 
             return list(localize_in_order(tasks, localize, localize, settings.min_confidence))
+
+    def answer_group(self, scan: Scan, tasks: Sequence[Task]) -> list[Result]:
+        """Localize photos of one place that were sent together."""
+        scan_map, _ = scan.require_default_method("photos together", self.settings)
+        with temporary_folder() as folder:
+            asked = []
+            for task in tasks:
+                task.write_files(folder)
+                assert isinstance(task.settings, CoarseToFineSettings)
+                asked.append(
+                    AskedTogether(replace(task.photo, picture=folder / task.photo.path), task.settings)
+                )
+            found = localize_photos_together(scan_map, scan.reader, scan.workers, asked)
+            return [rename(result, f"{folder}{os.sep}") for result in found]
 
     def give_up(self, task: Task, error: WorkerLostError, cloud_sha256: str | None) -> Answer:
         """Return the answer to a task whose workers were lost."""

@@ -4,7 +4,7 @@ import asyncio
 import json
 import logging
 import secrets
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
 from importlib.resources import files
@@ -30,9 +30,9 @@ from ..problem.settings import CoarseToFineSettings
 from ..report import site
 from ..scan_map.scan_map import ScanMap
 from .access import Access
-from .asking import FORM, apply_options, make_photo, parse_options, read_form
+from .asking import FORM, apply_options, are_together, make_photo, parse_options, read_form
 from .description import describe_service
-from .desk import Desk, Drawing, Limits, content_of, look_at
+from .desk import Desk, Drawing, Limits, Sent, content_of, look_at
 from .guard import COOKIE, RETRY, SHORTAGE, Guard, refusal_of, refuse, refusing
 from .keep import Keep
 
@@ -118,10 +118,10 @@ class Service:
 
     async def localize(self, request: Request) -> Response:
         """Return the line of a photo, as localize.py writes it; of several photos a line for each."""
-        async with self.asking(request) as tasks:
+        async with self.asking(request) as sent:
             with self.desk.in_use() as desk:
-                results = await unless_gone(request, self.answer(desk, tasks))
-                for task, result in zip(tasks, results, strict=True):
+                results = await unless_gone(request, self.answer(desk, sent))
+                for task, result in zip(sent.tasks, results, strict=True):
                     await self.keep_photo(task, result)
         if len(results) == 1:
             return Response(results[0].to_json(), media_type="application/json")
@@ -129,13 +129,13 @@ class Service:
 
     async def show(self, request: Request) -> Response:
         """Return photos for the page, of each a line with its result, then a line with its pictures."""
-        async with self.asking(request) as tasks:
+        async with self.asking(request) as sent:
             with self.desk.in_use() as desk:
-                results = await unless_gone(request, self.answer(desk, tasks))
-                kept = [await self.keep_photo(*one) for one in zip(tasks, results, strict=True)]
+                results = await unless_gone(request, self.answer(desk, sent))
+                kept = [await self.keep_photo(*one) for one in zip(sent.tasks, results, strict=True)]
 
         async def lines() -> AsyncIterator[str]:
-            for task, result, name in zip(tasks, results, kept, strict=True):
+            for task, result, name in zip(sent.tasks, results, kept, strict=True):
                 about = photo_document(name or result.pano, result, desk.scan_map)
                 yield f'{{"photo": {json.dumps(about)}, "result": {result.to_json()}}}\n'
                 with desk.in_use():
@@ -185,7 +185,7 @@ class Service:
         return Response(found, media_type="image/jpeg")
 
     @asynccontextmanager
-    async def asking(self, request: Request) -> AsyncIterator[list[Task]]:
+    async def asking(self, request: Request) -> AsyncIterator[Sent]:
         """Yield the photos that were sent, when all of them are there; HTTPException if too many wait."""
         self.look_for_another_scan()
         if request.query_params:
@@ -196,7 +196,9 @@ class Service:
                 await form.close()
                 options = parse_options(text)
                 settings = self.settings_of(options)
-                yield [Task(make_photo(name, options), settings, {name: pictures[name]}) for name in pictures]
+                photos = {name: make_photo(name, options) for name in pictures}
+                tasks = [Task(photo, settings, {name: pictures[name]}) for name, photo in photos.items()]
+                yield Sent(tasks, are_together(options))
 
     @contextmanager
     def place(self, num: int = 1) -> Iterator[None]:
@@ -215,9 +217,9 @@ class Service:
         assert isinstance(settings, CoarseToFineSettings)
         return apply_options(settings, options)
 
-    async def answer(self, desk: Desk, tasks: Sequence[Task]) -> list[Result]:
-        """Localize photos together; HTTPException for one alone that can't be read."""
-        results: list[Result] = await work(desk.processes, tasks, len(tasks))
+    async def answer(self, desk: Desk, sent: Sent) -> list[Result]:
+        """Localize the photos of a request; HTTPException for one alone that can't be read."""
+        results: list[Result] = await work(desk.processes, sent, len(sent.tasks))
         for result in results:
             if result.status == FAILED:
                 LOG.warning("a photo was given up: %s", result.error)

@@ -16,7 +16,7 @@ from ..files.json_file import DAMAGE
 from ..photo import Photo, Prior
 from ..problem.settings import CoarseToFineSettings
 
-PARTS = ("photo", "prior", "gravity", "min_confidence")
+PARTS = ("photo", "prior", "gravity", "min_confidence", "together")
 # options of a photo that name no file
 PHOTO = {f.name for f in fields(Photo)} - {"picture", "mask", "rig"}
 PRIOR = {f.name for f in fields(Prior)}
@@ -92,6 +92,14 @@ def make_photo(name: str, options: Mapping[str, Any]) -> Photo:
         return Photo(Path(name), **given)
     except DAMAGE as error:
         raise InputError(f"options.photo: {error}") from error
+
+
+def are_together(options: Mapping[str, Any]) -> bool:
+    """Return True if the photos are said to be of one place; InputError for what is no truth value."""
+    given = options.get("together", False)
+    if not isinstance(given, bool):
+        raise InputError(f"options.together: found {printable(str(given))[:40]!r}, wanted true or false")
+    return given
 
 
 def apply_options(settings: CoarseToFineSettings, options: Mapping[str, Any]) -> CoarseToFineSettings:

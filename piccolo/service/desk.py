@@ -40,6 +40,13 @@ class Limits(NamedTuple):
     seconds: float  # from the moment that a process takes it
 
 
+class Sent(NamedTuple):
+    """The photos of a request."""
+
+    tasks: Sequence[Task]
+    are_together: bool  # they are of one place
+
+
 class Drawing(NamedTuple):
     """A photo whose pictures are wanted, for the page."""
 
@@ -128,7 +135,7 @@ def look_at(paths: Sequence[Path]) -> list[object]:
 def open_answering(localizer: Localizer, max_pixels: float) -> Function:
     """Open what a process answers with.
 
-    Tasks get their results, those of several photos help each other; a `Drawing` gets the JSON of its
+    Photos that were sent get their results, and several help each other; a `Drawing` gets the JSON of its
     pictures; None makes ready for both.
     """
     tempfile.tempdir = os.environ.get("TMPDIR")  # or it is tried out, and on a full disk found not to exist
@@ -140,15 +147,19 @@ def open_answering(localizer: Localizer, max_pixels: float) -> Function:
         points = scan.prepared.points.subsample(MAX_SURFELS)
         return make_surfels(points, scan.workers), points
 
-    def work(item: Sequence[Task] | Drawing | None) -> list[Result] | str | None:
+    def work(item: Sent | Drawing | None) -> list[Result] | str | None:
         if isinstance(item, Drawing):
             return draw(scan, surfels(), item)
         if item is None:
             surfels()
             return None
-        for task in item:
+        for task in item.tasks:
             check_size(task, max_pixels)
-        return [answer(item[0]).result] if len(item) == 1 else localizer.answer_together(scan, item)
+        if len(item.tasks) == 1:
+            return [answer(item.tasks[0]).result]
+        if item.are_together:
+            return localizer.answer_group(scan, item.tasks)
+        return localizer.answer_in_order(scan, item.tasks)
 
     return work
 
