@@ -165,7 +165,7 @@ def test_a_frame_that_is_sure_beyond_reach_of_the_walk_is_told_but_not_believed(
     tracker = SimpleNamespace(settings=CoarseToFineSettings())
     sure = _judged(make_belief([0.98, 0.01]))
     told = make_localization(tracker, Frame(0.0, alone=sure), NOTHING)
-    assert (told.status, told.pose) == ("not_localized", sure.pose)
+    assert (told.status, told.best_pose) == ("not_localized", sure.best_pose)
     assert told.confidence == pytest.approx(0.49)
     unsure = replace(sure, status="ambiguous")
     assert make_localization(tracker, Frame(0.0, alone=unsure), NOTHING) is unsure

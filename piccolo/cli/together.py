@@ -41,7 +41,8 @@ from .options import DEFAULT_EVERY
 
 KNOWN = "their camera must be known: refine it with a single photo"
 IN_TURN = "its frames come one after another"
-AS_ONE = "its photos are weighed together, in one process"
+AS_ONE = "its photos are weighed as one camera, in one process"
+IN_GROUPS = "which photos belong together is decided in one process"
 NO_COLORS = "labels are no colours"
 IN_ROUNDS = "a photo needs the colours of all others"
 OTHER = "photos are localized together in one way"
@@ -54,7 +55,13 @@ NOT_WITH: Mapping[str, Mapping[str, str]] = {  # options that do not go with wha
         "refine_focal": KNOWN,
     },
     "--relative": {"walk": OTHER, "video": OTHER, "jobs": AS_ONE, "dask": AS_ONE, "refine_focal": KNOWN},
-    "--together": {"walk": OTHER, "relative": OTHER, "jobs": AS_ONE, "dask": AS_ONE, "labels": NO_COLORS},
+    "--together": {
+        "walk": OTHER,
+        "relative": OTHER,
+        "jobs": IN_GROUPS,
+        "dask": IN_GROUPS,
+        "labels": NO_COLORS,
+    },
     "--color-scan": {
         "walk": OTHER,
         "video": OTHER,
