@@ -99,6 +99,25 @@ def test_sure_photos_elsewhere_speak_against_the_relative_poses():
     assert bundle_search.weigh_bundles([[own, own, out]], members)[0] > 0.9
 
 
+def test_photos_that_show_the_same_count_as_one():
+    """Four of a burst of one wall, a quarter of the weight each, are one witness; so are those against."""
+    burst = [_support(9.0)._replace(weight=0.25)] * 4
+    one = bundle_search.weigh_bundles([[_support(9.0)]], TEN[:1])
+    assert bundle_search.weigh_bundles([burst], TEN[:1] * 4)[0] == pytest.approx(one[0], abs=0.02)
+    assert bundle_search.weigh_bundles([[_support(9.0)] * 4], TEN[:4])[0] > 0.999
+    elsewhere = [_support(30.0)._replace(weight=0.25).miss()] * 4
+    sure = [_alone(0.97)] * 4
+    assert bundle_search.weigh_bundles([elsewhere], sure)[-1] > 0.5
+
+
+def test_a_photo_that_a_place_does_not_show_is_at_another():
+    missed = _support(30.0, 2.0).miss()
+    assert (missed.odds, missed.odds_elsewhere, missed.is_found) == (0.0, 32.0, False)
+    assert missed.shares.argmax() == 3
+    weak = _support(30.0)._replace(belongs=0.7)
+    assert 0.9 < weak.shares[:2].sum() < _support(30.0).shares[:2].sum()
+
+
 @pytest.mark.parametrize("std", [0.005, 0.06, 0.3])
 def test_a_certain_place_counts_whole_however_inexact_the_pose_is(std):
     """How exact it is counts once, in the end."""
