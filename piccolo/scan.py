@@ -7,24 +7,14 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from .arguments import check_kind, check_one_each
 from .arrays import Bytes, Floats
 from .cloud.settings import CloudSettings
 from .cloud.soa import PackedPoints
-from .coloring.color_scan import (
-    OF_RESULTS,
-    Coloring,
-    check_files,
-    check_suffix,
-    color_if_enough,
-    localize_for_colors,
-)
+from .coloring.color_scan import Coloring
 from .errors import InputError
 from .evidence.occlusion import occlusion_mask
 from .files.atomic import check_output
-from .files.line_file import Journal
 from .geometry.pose import Gravity, Pose, check_pose
 from .jobs.threads import Workers
 from .judge.result import Result
@@ -35,6 +25,7 @@ from .photo import File, Photo, Prior, as_photo
 from .photo_reader import PhotoReader, Settings
 from .problem.settings import CoarseToFineSettings
 from .scan_bundle import AskedPosed, localize_posed
+from .scan_coloring import color_by
 from .scan_group import AskedTogether, localize_photos_together
 from .scan_map.open_map import write_map
 from .scan_map.scan_map import ScanMap, check_within
@@ -270,21 +261,11 @@ class Scan:
         settings = self._change(prior, gravity, min_confidence)
         scan_map, settings = self.require_default_method("color", settings)
         asked = [Asked(as_photo(photo), settings) for photo in photos]
-        path = Path(out)
-        files = [Path(name) for name in ([self.name] if isinstance(self.name, str) else self.name)]
-        check_files(files)
-        check_suffix(path)
-        check_output(path)
-        if any(isinstance(one.photo.picture, np.ndarray) for one in asked):
-            raise InputError("`photos`: found an array, wanted files, which are read again for their colours")
 
-        def localize(shown: ScanMap, k: int) -> Result:
-            result = replace(self, prepared=shown).try_photo(asked[k])
-            return replace(result, settings={**result.settings, **OF_RESULTS})
+        def localize(shown: ScanMap, one: Asked) -> Result:
+            return replace(self, prepared=shown).try_photo(one)
 
-        steps = [one.photo.name for one in asked]
-        results = localize_for_colors(scan_map, steps, localize, len(asked), self.workers, Journal())
-        return color_if_enough(files, scan_map, self.cloud_settings, results, path, self.workers)
+        return color_by(self.name, scan_map, self.cloud_settings, asked, localize, Path(out), self.workers)
 
     def localize_together(
         self,
@@ -296,17 +277,15 @@ class Scan:
     ) -> list[Result]:
         """Localize photos that were taken at one place or on a short way, in any order, by what they share.
 
-        The program finds which of them show the same. Photos that belong to no other are localized alone, and
-        one that can't be read has a result that says so. `beside` of a result names those that it was
-        localized with.
+        Photos that show nothing of others are localized alone, and one that can't be read has a result that
+        says so. `beside` of a result names those that it was localized with.
         """
         check_kind("photos", photos, Iterable[Picture])
-        given = [as_photo(photo) for photo in photos]
         settings = self._change(prior, gravity, min_confidence)
         scan_map, settings = self.require_default_method("photos together", settings)
-        for photo in given:
-            self.check_options(photo, settings)
-        asked = [AskedTogether(photo, settings) for photo in given]
+        asked = [AskedTogether(as_photo(photo), settings) for photo in photos]
+        for one in asked:
+            self.check_options(one.photo, settings)
         return localize_photos_together(scan_map, self.reader, self.workers, asked)
 
     def track(

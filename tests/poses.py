@@ -31,7 +31,8 @@ def result(pano, pose, status="localized", cloud="a.ply", **changes):
 def judged(status, belief, pose, **more):
     """The result of a photo alone, its probabilities as they are believed."""
     probabilities = belief.probabilities.tolist()
-    best, none = probabilities[0], probabilities[-1]
+    best = probabilities[0]
+    none = probabilities[-1]
     return Result(status, best, best_pose=pose, belief=belief, probability_none=none, **more)
 
 

@@ -27,6 +27,7 @@ LAYERS = [
     "opening",
     "scan",
     "scan_walk",
+    "scan_coloring",
     "scan_group",
     "scan_bundle",
     "scan_photo",

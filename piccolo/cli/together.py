@@ -143,14 +143,19 @@ def run_together(
     return code
 
 
+def print_each(arguments: Arguments, scan: Scan, results: Sequence[Result]) -> None:
+    """Print results with their own warnings, without those of the scan."""
+    for result in results:
+        print_result(arguments, result, result.warnings[len(scan.warnings) :])
+
+
 def ask_for_bundle(
     arguments: Arguments, photos: Sequence[Path], localizer: Localizer, scan: Scan, write_steps: WriteSteps
 ) -> Printed:
     """Return the job of --relative."""
 
     def report(results: Sequence[Result]) -> tuple[str, bool]:
-        for result in results:
-            print_result(arguments, result, result.warnings[len(scan.warnings) :])
+        print_each(arguments, scan, results)
         return "", True
 
     return Printed(make_bundle_job(localizer, scan, photos, arguments.relative, write_steps), report)
@@ -162,8 +167,7 @@ def ask_for_group(
     """Return the job of --together."""
 
     def report(results: Sequence[Result]) -> tuple[str, bool]:
-        for result in results:
-            print_result(arguments, result, result.warnings[len(scan.warnings) :])
+        print_each(arguments, scan, results)
         num_together = sum(result.beside is not None for result in results)
         return f"; {num_together} of them by others too", True
 

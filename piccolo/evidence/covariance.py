@@ -354,7 +354,8 @@ def estimate_covariance(
     of_grid = np.diag(np.repeat([turn**2, (turn * median_range) ** 2], 3))  # and of stitching, in all blocks
     own = turn_positions(covariance, turned) + of_grid
     common = scan_covariance(problem.scan_map, median_range)
-    own, common = profile.own_share * own, common + (1.0 - profile.own_share) * own
+    common = common + (1.0 - profile.own_share) * own
+    own = profile.own_share * own
     std_of_fit = largest_std(own + common)
     if profile.compares_halves:
         added = disagreement(photo, points, pose, covariance, method.halves_score, workers)

@@ -285,7 +285,8 @@ def view_positions(centers: Array, look: Look, num_rings: int, num_known: int = 
     order = np.argsort(np.rint(off / HEIGHT_STEP), kind="stable")
     order = order[order >= num_known]
     look = lru_cache(maxsize=None)(look)
-    cells, spacing = cell_table(num_rings), VIEW_SPACING
+    cells = cell_table(num_rings)
+    spacing = VIEW_SPACING
     while (kept := choose(order, centers, num_known, look, cells, spacing)) is None:
         spacing *= SPACING_GROWTH
     return kept

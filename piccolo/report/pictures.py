@@ -214,7 +214,8 @@ def draw_plan(points: PackedPoints, places: Array, floors: Array) -> PlanImage |
     if shown is None:
         return None
     x, y, above, rgb = shown
-    width, height = np.ptp(x) + 2 * PLAN_MARGIN, np.ptp(y) + 2 * PLAN_MARGIN
+    width = np.ptp(x) + 2 * PLAN_MARGIN
+    height = np.ptp(y) + 2 * PLAN_MARGIN
     pixel = max(PIXEL, float(max(width, height)) / MAX_PLAN_SIDE)
     left = float(x.min()) - PLAN_MARGIN
     top = float(y.max()) + PLAN_MARGIN
@@ -231,7 +232,8 @@ def _of_storey(
     """X, y and height above the floor [m] of a storey's points below the cut, and their colours (N, 3)."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # who draws no plan need not wait for it
 
-    low, high = places[:, :2].min(axis=0) - CAMERA_REACH, places[:, :2].max(axis=0) + CAMERA_REACH
+    low = places[:, :2].min(axis=0) - CAMERA_REACH
+    high = places[:, :2].max(axis=0) + CAMERA_REACH
     count = np.ceil((high - low) / FLOOR_CELL).astype(np.int64) + 1
     grid = np.stack(np.meshgrid(*(np.arange(n) for n in count), indexing="ij"), axis=-1).reshape(-1, 2)
     distance, nearest = cKDTree(places[:, :2]).query(low + (grid + 0.5) * FLOOR_CELL)

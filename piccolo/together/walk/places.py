@@ -83,7 +83,8 @@ def find_places(problem: Problem, own: Pose, means: Means) -> list[Place]:
 
 def list_places(problem: Problem, ends: Ends, own_score: float) -> list[Place]:
     """List the distinct ends with their odds to a pose of a score."""
-    R, centers = ends.poses.R_cam_from_map, ends.poses.center_map
+    R = ends.poses.R_cam_from_map
+    centers = ends.poses.center_map
     kept = non_maximum_suppression(R, centers, MOST_PLACES, ONE_ANSWER)
     found = zip(ends.poses.take(kept).poses(), ends.scores[kept], strict=True)
     return [(pose, log_behind(problem, float(score), own_score)) for pose, score in found]

@@ -1,0 +1,53 @@
+"""A scan in the colours of photos, as `Scan.color` makes it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from .cloud.settings import CloudSettings
+from .coloring.color_scan import (
+    OF_RESULTS,
+    Coloring,
+    check_files,
+    check_suffix,
+    color_if_enough,
+    localize_for_colors,
+)
+from .errors import InputError
+from .files.atomic import check_output
+from .files.line_file import Journal
+from .jobs.threads import Workers
+from .judge.result import Result
+from .scan_map.scan_map import ScanMap
+from .scan_photo import Asked
+
+
+def color_by(
+    name: str | tuple[str, ...],
+    scan_map: ScanMap,
+    cloud_settings: CloudSettings,
+    asked: Sequence[Asked],
+    localize: Callable[[ScanMap, Asked], Result],
+    out: Path,
+    workers: Workers,
+) -> Coloring:
+    """Localize photos, again in each other's colours, and write the files of a scan's name in these.
+
+    `localize` returns the result of a photo in the scan as it is shown to it.
+    """
+    files = [Path(path) for path in ([name] if isinstance(name, str) else name)]
+    check_files(files)
+    check_suffix(out)
+    check_output(out)
+    if any(isinstance(one.photo.picture, np.ndarray) for one in asked):
+        raise InputError("`photos`: found an array, wanted files, which are read again for their colours")
+
+    def localize_one(shown: ScanMap, k: int) -> Result:
+        result = localize(shown, asked[k])
+        return replace(result, settings={**result.settings, **OF_RESULTS})
+
+    steps = [one.photo.name for one in asked]
+    results = localize_for_colors(scan_map, steps, localize_one, len(asked), workers, Journal())
+    return color_if_enough(files, scan_map, cloud_settings, results, out, workers)
