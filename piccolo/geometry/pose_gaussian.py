@@ -61,18 +61,32 @@ class PoseGaussian:
         What both have in common makes no difference.
         """
         step = subtract(other.pose, self.pose)
-        return float(step @ np.linalg.solve(self.own + other.own, step))
+        mine, theirs = self.split_from(other)
+        return float(step @ np.linalg.solve(mine + theirs, step))
+
+    def split_from(self, other: "PoseGaussian") -> tuple[Array, Array]:
+        """Return the covariances (6, 6) of what this pose and another do not have in common.
+
+        If errors in common make one pose more uncertain than the other, as that of a photo of a bare wall,
+        only the excess counts.
+        """
+        variances, axes = np.linalg.eigh(self.common - other.common)
+        mine = (axes * np.maximum(variances, 0.0)) @ axes.T
+        theirs = (axes * np.maximum(-variances, 0.0)) @ axes.T
+        return self.own + mine, other.own + theirs
 
     def fuse(self, other: "PoseGaussian") -> "PoseGaussian":
-        """Return the mean of two estimates of a pose, weighted by the covariances of their own errors.
+        """Return the mean of two estimates of a pose, weighted by what they do not have in common.
 
-        If they contradict each other, these grow by as much.
+        If they contradict each other, the covariance of its own error grows by as much.
         """
         excess = max(self.square_distance(other) - LIKELY, 0.0) + 1.0
-        gain = self.own @ np.linalg.inv(self.own + other.own)  # of Kalman
+        mine, theirs = self.split_from(other)
+        gain = mine @ np.linalg.inv(mine + theirs)  # of Kalman
+        rest = np.eye(6) - gain
         pose = add(self.pose, gain @ subtract(other.pose, self.pose))
-        own = excess * (self.own - gain @ self.own)
-        root = (np.eye(6) - gain) @ square_root(self.common) + gain @ square_root(other.common)
+        own = excess * (rest @ self.own @ rest.T + gain @ other.own @ gain.T)
+        root = rest @ square_root(self.common) + gain @ square_root(other.common)
         return PoseGaussian(pose, 0.5 * (own + own.T), root @ root.T)
 
 

@@ -232,15 +232,21 @@ def exact_pose(matches: Matches, rough: Pose) -> MatchedPose | None:
     if max(counts, default=0) < LEAST_MATCHES:
         return None
     best = np.argmax(counts)
-    pose = Pose(rotations[best].copy(), centers[best].copy())
-    R = pose.R_cam_from_world
-    t = pose.center_world
+    pose = Pose(rotations[best], centers[best])
     for _ in range(2):
-        members = find_inliers(matches, pose, COS_EXACT)
-        rays = matches.rays[members].astype(np.float64)
-        points = matches.points[members].astype(np.float64)
-        descend_matches((rays, points, REFINE_SCALE), REFINEMENTS, REFINE_TOLERANCE, R, t)
+        pose = refine_on(matches, pose, REFINEMENTS)
     return MatchedPose(pose, count_matches(matches, pose))
+
+
+def refine_on(matches: Matches, pose: Pose, num_steps: int) -> Pose:
+    """Refine a pose on the matches that agree with it."""
+    members = find_inliers(matches, pose, COS_EXACT)
+    rays = matches.rays[members].astype(np.float64)
+    points = matches.points[members].astype(np.float64)
+    R = pose.R_cam_from_world.copy()
+    t = pose.center_world.copy()
+    descend_matches((rays, points, REFINE_SCALE), num_steps, REFINE_TOLERANCE, R, t)
+    return Pose(R, t)
 
 
 def propose_poses(matches: Matches, count: int, workers: Workers) -> list[MatchedPose]:

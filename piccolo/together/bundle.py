@@ -205,9 +205,8 @@ def blur_local(
         shares = {}
         for k, (found, cam_from_bundle) in own.items():
             rest = [one for n, one in blurred.items() if n != k]
-            expected = adjust(bundle, rest, errors).predict(cam_from_bundle, errors)
-            odds = (1.0 - local_shares[k]) * (compare_errors(expected, found) if rest else 1.0)
-            shares[k] = local_shares[k] / (local_shares[k] + odds)
+            expected = adjust(bundle, rest, errors).predict(cam_from_bundle, errors) if rest else None
+            shares[k] = weigh_local(local_shares[k], expected, found)
     return blurred
 
 
@@ -314,6 +313,12 @@ def judge_placed(
     belief = believe_together(shares, probabilities, within, within_others, alone)
     found = recalibrate_at(member, support, gaussian.pose, elsewhere, means.workers)
     return judge_together(found, gaussian, belief, means, min_confidence)
+
+
+def weigh_local(share: float, expected: PoseGaussian | None, own: PoseGaussian) -> float:
+    """Return the probability that a photo's own pose is a local optimum, by where the others expect it."""
+    odds = (1.0 - share) * (1.0 if expected is None else compare_errors(expected, own))
+    return share / (share + odds)
 
 
 def compare_errors(expected: PoseGaussian, own: PoseGaussian) -> float:

@@ -12,19 +12,17 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array
-from ..evidence.verification import match_covariance
 from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose
-from ..geometry.pose_gaussian import PoseGaussian
+from ..geometry.pose_gaussian import LIKELY, PoseGaussian
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.by_others import LOCAL_ERRORS, Shares
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result
 from ..local_features.hypotheses import count_matches
-from ..local_features.matching import merge_matches
 from ..localization.means import Means
 from ..scan_map.scan_map import ScanMap
-from .bundle import EVEN_ODDS, judge_placed, place_between
+from .bundle import EVEN_ODDS, judge_placed, place_between, weigh_local
 from .bundle_search import NUM_BUNDLES, Support, find_support, weigh_bundles
 from .links import FIRM, WEAK, Links, Places, are_bridged, compute_shared, find_links, find_pose, spread
 from .members import Member, Shot, find_members
@@ -33,7 +31,9 @@ NUM_ANCHORS = 2  # poses of a photo from which a place of the group may follow, 
 LEAST_LIKELY = 1e-3  # chosen: probability of such a pose
 MOST_SPREAD = 12  # places of the group that are looked at
 BELONGS_WEAKLY = 0.7  # chosen: probability that a photo belongs where few matches put it
-MOST_SOURCES = 3  # photos by which a photo is placed, those with the most matches
+MOST_SOURCES = 3  # photos by whose errors a photo is placed
+MOST_STD_OF_SOURCE = 0.1  # chosen: [m] deviation of the own pose of one by which others are placed
+NUM_LOCATED = 2  # rounds in which local optima are told from right poses
 UNCERTAIN = np.zeros((6, 6))
 
 
@@ -197,44 +197,66 @@ def judge_group(
 ) -> dict[int, Result]:
     """Return the results of the photos that belong to the first of several places of their group."""
     best, *elsewhere = tested
-    own = {
-        number: support.gaussian.blur(support.local_share * LOCAL_ERRORS)
-        for number, support in best.supports.items()
-        if support.shares.argmax() == 0 and support.gaussian is not None
-    }
-    expected = expect_all(group.links, best.places, own)
+    own, expected = locate_all(group.links, best)
     results = {}
     for number, support in best.supports.items():
         member = group.members[number]
         belongs = Shares(*support.shares[:2].tolist())
-        placed = place_between(belongs, own.get(number), expected.get(number))
+        is_sure = member.alone.status == LOCALIZED
+        of_others = expected.get(number)
+        if is_sure and of_others and number in own and own[number].square_distance(of_others) > LIKELY:
+            of_others = None  # few matches contradict what is sure
+        placed = place_between(belongs, own.get(number), of_others)
         is_refused = bool(member.alone.belief.ruled_out) and not member.is_misplaced
         is_own = support.is_found and placed.shares.right >= placed.shares.missed
         if is_refused or placed.gaussian is None or belongs.here < EVEN_ODDS:
             continue
-        if member.alone.status == LOCALIZED and not is_own:  # what is sure alone others do not move
+        if is_sure and not is_own:  # what is sure alone others do not move
             continue
         others = [k for k, one in enumerate(elsewhere) if number in one.places]
         poses = [elsewhere[k].places[number].pose for k in others]
         of_places = probabilities[[0, *(k + 1 for k in others)]]
         of_all = np.append(of_places, 1.0 - of_places.sum())
-        results[number] = judge_placed(
-            member, support, placed, number in own, poses, of_all, means, min_confidence
-        )
+        result = judge_placed(member, support, placed, number in own, poses, of_all, means, min_confidence)
+        if result.status == LOCALIZED or not is_sure:
+            results[number] = result
     return results
 
 
+def locate_all(links: Links, tested: Tested) -> tuple[dict[int, PoseGaussian], dict[int, PoseGaussian]]:
+    """Return the photos' own poses that agree with a place, and where the others expect each photo.
+
+    Own poses have the errors of local optima too, as far as they may be such. Poses and probabilities are
+    found in turn, as in a bundle.
+    """
+    found = {
+        number: support.gaussian
+        for number, support in tested.supports.items()
+        if support.shares.argmax() == 0 and support.gaussian is not None
+    }
+    local_shares = {number: tested.supports[number].local_share for number in found}
+    shares = local_shares
+    for _ in range(NUM_LOCATED):
+        own = {number: one.blur(shares[number] * LOCAL_ERRORS) for number, one in found.items()}
+        expected = expect_all(links, tested.places, own)
+        shares = {k: weigh_local(local_shares[k], expected.get(k), one) for k, one in found.items()}
+    return own, expected
+
+
 def expect_all(links: Links, places: Places, own: Mapping[int, PoseGaussian]) -> dict[int, PoseGaussian]:
-    """Return where the others expect each photo, by their own poses or by where they are expected."""
-    located = {k: links.place(k, gaussian.pose) for k, gaussian in own.items()}
-    known = dict(own)
+    """Return where the others expect each photo, by their own poses or by where they are expected.
+
+    A photo whose own pose is uncertain, as of a bare wall, is where it is expected.
+    """
+    known = {number: one for number, one in own.items() if one.largest_std < MOST_STD_OF_SOURCE}
+    located = {number: links.place(number, one.pose) for number, one in known.items()}
     expected: dict[int, PoseGaussian] = {}
-    for number in [*own, *(k for k in places if k not in own)]:
+    for number in [*known, *(k for k in places if k not in known)]:
         rest = {k: gaussian for k, gaussian in known.items() if k != number}
         found = expect(links, number, {k: located[k] for k in rest}, rest)
         if found is not None:
             expected[number] = found
-            if number not in own:
+            if number not in known:
                 known[number] = found
                 located[number] = links.place(number, found.pose)
     return expected
@@ -245,18 +267,19 @@ def expect(
 ) -> PoseGaussian | None:
     """Return the pose of a photo by its matches with others; None if too few agree.
 
-    Its errors are those of the matches, and of the poses of the photos with the most of them.
+    Its errors are those of the matches, and of the poses of the photos that tell the most.
     """
     parts = links.match(number, located)
-    pose = None
-    if parts:
-        pose = find_pose(parts.values(), [known[k].pose for k in parts], WEAK, links.workers)
-    if pose is None:
+    if not parts:
         return None
-    counts = {k: count_matches(matches, pose) for k, matches in parts.items()}
-    sources = sorted(counts, key=lambda k: -counts[k])[:MOST_SOURCES]
-    shares = np.array([counts[k] for k in sources]) / sum(counts[k] for k in sources)
-    attached = [known[k].attach(pose @ known[k].pose.inverse(), UNCERTAIN) for k in sources]
+    found = find_pose(parts.values(), [known[k].pose for k in parts], WEAK, links.workers)
+    if found is None:
+        return None
+    counts = {k: count_matches(matches, found.pose) for k, matches in parts.items()}
+    telling = {k: counts[k] / known[k].largest_std ** 2 for k in parts}
+    sources = sorted(telling, key=lambda k: -telling[k])[:MOST_SOURCES]
+    shares = np.array([telling[k] for k in sources]) / sum(telling[k] for k in sources)
+    attached = [known[k].attach(found.pose @ known[k].pose.inverse(), UNCERTAIN) for k in sources]
     own = sum((share**2 * one.own for share, one in zip(shares, attached, strict=True)), UNCERTAIN)
     common = sum((share * one.common for share, one in zip(shares, attached, strict=True)), UNCERTAIN)
-    return PoseGaussian(pose, own + match_covariance(merge_matches(list(parts.values())), pose), common)
+    return PoseGaussian(found.pose, own + found.covariance, common)

@@ -24,6 +24,7 @@ from ..local_features.hypotheses import count_matches, propose_poses
 from ..local_features.keypoints import Keypoints
 from ..local_features.matching import Matches, match_pictures, merge_matches
 from ..problem.problem import Problem
+from .relation import Relation, relate
 
 LEAST_LINKED = 6  # matches of two photos that may show the same
 LEAST_BRIDGE = 5  # matches that agree with two poses that were found apart
@@ -156,19 +157,20 @@ def spread(links: Links, anchors: Places, numbers: Collection[int], trust: Trust
             return places
         tried.add((number, len(asked[number])))
         near = [places[other].pose for other in asked[number]]
-        pose = find_pose(asked[number].values(), near, trust, links.workers)
-        if pose is not None:
-            places[number] = links.place(number, pose)
+        found = find_pose(asked[number].values(), near, trust, links.workers)
+        if found is not None:
+            places[number] = links.place(number, found.pose)
 
 
 def find_pose(
     matches: Iterable[Matches], near: Collection[Pose], trust: Trust, workers: Workers
-) -> Pose | None:
+) -> Relation | None:
     """Return a photo's pose by its matches with others, whose poses are `near`; None if too few agree."""
-    proposed = propose_poses(merge_matches(list(matches)), NUM_PROPOSED, workers)
+    merged = merge_matches(list(matches))
+    proposed = propose_poses(merged, NUM_PROPOSED, workers)
     for pose in (one.pose for one in proposed if one.num_matches >= trust.least):
         if min(pose.distance(other) for other in near) <= trust.reach:
-            return pose
+            return relate(merged, pose)
     return None
 
 

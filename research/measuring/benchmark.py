@@ -4,7 +4,7 @@ from argparse import ArgumentParser
 
 from piccolo.cli.command import Arguments, add_command, command
 
-from . import calibration, confidence, page, sensitivity
+from . import calibration, confidence, groups, page, sensitivity
 
 EPILOG = """\
 example:
@@ -14,6 +14,7 @@ example:
 MEASUREMENTS = {
     "all": page,
     "confidence": confidence,
+    "groups": groups,
     "calibration": calibration,
     "sensitivity": sensitivity,
 }

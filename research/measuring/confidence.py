@@ -189,7 +189,7 @@ def photo_trials(scene: Scene, others: Sequence[Scene], number: int) -> Iterator
             photo = worlds.cut_photo(read_panorama(query.image).rgb, query.pose, fov_deg, rng)
             case = f"{fov_deg // 10:.0f}0 deg" if one is scene else "elsewhere"
             true_pose = photo.pose if one is scene else None
-            rgb = worlds.change_sensor(photo.rgb, rng)
+            rgb = worlds.change_sensor(photo.rgb, rng, rng)
             trials.append(Trial(case, rgb, true_pose, focal_px=photo.focal_px))
     yield (cloud.points + cloud.origin_world, cloud.colors), trials
 

@@ -275,13 +275,16 @@ def write_photo(photo: Photo, path: Path) -> None:
     write_atomically(path, file.getvalue())
 
 
-def change_sensor(rgb: Bytes, rng: np.random.Generator) -> Bytes:
-    """Process a photo (H, W, 3) as another phone would: light, colours, sharpness, noise and file."""
+def change_sensor(rgb: Bytes, rng: np.random.Generator, noise: np.random.Generator) -> Bytes:
+    """Process a photo (H, W, 3) as another phone would: light, colours, sharpness, noise and file.
+
+    `noise` may be `rng`; photos of one phone have the same `rng` each, and other noise.
+    """
     linear = (rgb / 255.0) ** 2.2 * 2.0 ** rng.uniform(-0.7, 0.7) * rng.uniform(0.8, 1.25, 3)
     toned = linear.clip(0.0, 1.0) ** (1.0 / rng.uniform(1.7, 2.8))
     smooth = cv2.GaussianBlur(toned, (0, 0), rng.uniform(1.0, 3.0))
     sharpened = toned + rng.uniform(0.0, 1.0) * (toned - smooth)
-    noisy = 255.0 * sharpened + rng.normal(0.0, rng.uniform(0.0, 6.0), rgb.shape)
+    noisy = 255.0 * sharpened + noise.normal(0.0, rng.uniform(0.0, 6.0), rgb.shape)
     quality = int(rng.integers(50, 95))
     return compress(noisy, quality)
 

@@ -1,0 +1,68 @@
+"""The pose of a photo by its matches with others whose points the scan has, and the errors of that pose.
+
+Matches of a wall, or of few things far away, fit more than one pose nearly as well. So the loss is descended
+from both sides of the pose, along the two directions that the matches tell least of, and how far the other
+optima are counts among the errors as far as they are as likely.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arrays import Array
+from ..evidence.verification import DRAWN_INFLATION, match_covariance
+from ..geometry.pose import Pose, rotate_points
+from ..geometry.pose_gaussian import add, differentiate_rays, subtract
+from ..geometry.robust import geman_mcclure
+from ..local_features.hypotheses import COS_EXACT, REFINE_SCALE, find_inliers, refine_on
+from ..local_features.matching import Matches
+
+NUM_WEAK = 2  # directions in which a pose is tried
+TRIED = (0.15, 0.3)  # [m] on both sides of it
+RANGE_OF_TURN = 3.0  # chosen: [m] by which a turn [rad] is compared with a move
+NUM_STEPS = 30  # of a descent
+LEAST_MOVE = 0.05  # of a direction of unit length: others turn only
+
+
+class Relation(NamedTuple):
+    """A pose by matches."""
+
+    pose: Pose
+    covariance: Array  # (6, 6) as of `PoseGaussian`
+
+
+def relate(matches: Matches, near: Pose) -> Relation:
+    """Return the best pose near one by matches, and its errors."""
+    starts = [near, *(add(near, step) for step in list_weak_steps(matches, near))]
+    ends = [refine_on(matches, refine_on(matches, start, NUM_STEPS), NUM_STEPS) for start in starts]
+    losses = np.array([compute_match_loss(matches, end) for end in ends])
+    best = ends[int(losses.argmin())]
+    weights = np.exp(losses.min() - losses)
+    steps = np.array([subtract(end, best) for end in ends])
+    spread = (weights[:, None] * steps).T @ steps / weights.sum()
+    return Relation(best, DRAWN_INFLATION * match_covariance(matches, best) + spread)
+
+
+def list_weak_steps(matches: Matches, pose: Pose) -> list[Array]:
+    """Return steps (6,) in the directions that the matches that agree with a pose tell least of."""
+    agreeing = find_inliers(matches, pose, COS_EXACT)
+    _, J = differentiate_rays(matches.points[agreeing], pose)
+    units = np.array([1.0, 1.0, 1.0, *[1.0 / RANGE_OF_TURN] * 3])
+    _, axes = np.linalg.eigh(np.einsum("kai,kaj->ij", J * units, J * units))
+    steps = []
+    for direction in (units[:, None] * axes[:, :NUM_WEAK]).T:
+        move = float(np.linalg.norm(direction[3:]))
+        if move > LEAST_MOVE:
+            steps += [sign * size / move * direction for size in TRIED for sign in (1.0, -1.0)]
+    return steps
+
+
+def compute_match_loss(matches: Matches, pose: Pose) -> float:
+    """Return the loss of a pose, at most 1 for each of the photo's keypoints, by the best of its matches."""
+    offsets = rotate_points(matches.points - pose.center_world, pose.R_cam_from_world)
+    rays = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
+    squares = np.square(rays - matches.rays).sum(axis=1)
+    least = np.full(int(matches.query.max()) + 1, np.inf)
+    np.minimum.at(least, matches.query, squares)
+    losses, _ = geman_mcclure(least[np.isfinite(least)], REFINE_SCALE**-2)
+    return float(2.0 * losses.sum() / REFINE_SCALE**2)
