@@ -13,7 +13,7 @@ from plyfile import PlyData, PlyElement
 from poses import tilted_poses
 from rooms import query as read_photo_facts
 from scans import bare_room, points_of, scan, write_scan
-from test_cloud_ptx import scan as ptx_lines, write as write_lines
+from text_files import scan as ptx_lines, write_lines
 
 from piccolo.cli import align_gravity
 from piccolo.geometry.pose import exp_so3, transform_points

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 import rooms
 from batches import untimed
+from camera_room import SEED, place
 from pictures import encoded, write
 from poses import judged
-from test_localize_cameras import SEED, place
 
 from piccolo import open_scan, second_look
 from piccolo.batch.localizer import Localizer

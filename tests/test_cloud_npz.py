@@ -4,9 +4,9 @@ import zipfile
 
 import numpy as np
 import pytest
+from clouds import read, seeded_cloud
 from refusals import assert_refused
 from scans import read_cloud
-from test_cloud_morton import read, seeded_cloud
 
 from piccolo.cloud.readers import npz
 from piccolo.cloud.settings import IN_COLORS

@@ -10,7 +10,7 @@ import pytest
 import rooms
 from hypothesis import given, settings, strategies as st
 from refusals import assert_input_error
-from test_result import RESULT
+from results import RESULT
 
 import piccolo
 from piccolo import Pose, Result

@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rooms
+from camera_room import DENSE, SEED, TRUE, place
 from pictures import encoded, write
 from poses import judged
-from test_focal_length import DENSE, TRUE
-from test_localize_cameras import SEED, place
 
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole

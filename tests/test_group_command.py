@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 import rooms
+from groups import SEED, taken_photos
 from pictures import encoded, write
 from services import serving
-from test_group import SEED, taken_photos
 
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole

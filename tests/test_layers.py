@@ -176,3 +176,11 @@ def test_a_number_has_a_name_of_its_own():
             users.setdefault(name, set()).add(module)
     assert len(users) > 500
     assert {name: found for name, found in users.items() if len(found) > 1} == {}
+
+
+def test_no_test_imports_another():
+    """What tests share is in a module beside them."""
+    for path in sorted([*(ROOT / "tests").glob("*.py"), *(ROOT / "browser_tests").glob("*.py")]):
+        names = [node.module or "" for node in _nodes(path) if isinstance(node, ast.ImportFrom)]
+        names += [a.name for node in _nodes(path) if isinstance(node, ast.Import) for a in node.names]
+        assert not [name for name in names if name.startswith("test_")], path

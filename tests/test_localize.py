@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import rooms
 from batches import command_of, start_localize
+from results import RESULT
 from rooms import errors, query
-from test_result import RESULT
 
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole

@@ -6,9 +6,9 @@ from batches import main_of
 from e57_files import ScanToWrite, write as write_e57
 from las_files import OFFSETS, las_bytes, laz_bytes
 from meshes import Gltf, obj_text
+from pcd_files import ENCODINGS, content_of
 from plyfile import PlyData, PlyElement
 from rooms import assert_near
-from test_cloud_pcd import ENCODINGS, content_of
 
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.stream import FORMATS

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rooms
+from camera_room import DENSE, SEED, TRUE, place
 from pictures import encoded, write
 from poses import result
 from services import serving
-from test_focal_length import DENSE, TRUE
-from test_localize_cameras import SEED, place
 
 import piccolo
 from piccolo.batch.relative_poses import read_relative_poses

@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 import pytest
 import rooms
-from pictures import encoded, write
+from pictures import encoded, write, write_photo
 from poses import judged
 from refusals import assert_input_error
-from test_priors import write_photo
 
 from piccolo.batch.inputs import times_of
 from piccolo.errors import InputError
