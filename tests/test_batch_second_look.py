@@ -41,6 +41,8 @@ from piccolo.second_look import Looking
 from piccolo.together.second_looks import MOST_PICTURES, Look, list_looks_beside, localize_in_order
 from research.synthetic.world import render_picture
 
+TIER = "scene"
+
 PHONE = (Mount(pinhole(1024, 512, 400.0)),)
 NONE_ASKED = Beside((), "0" * 64)
 NOWHERE = Pose(np.eye(3), np.zeros(3))

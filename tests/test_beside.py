@@ -23,6 +23,8 @@ from piccolo.localization.judging import Found
 from piccolo.photo import Prior
 from piccolo.together.beside import Neighbor, SurePhoto, fuse, localize_beside
 
+TIER = "scene"
+
 
 def test_a_photo_is_localized_beside_one_that_shows_the_same():
     """Without a pose of its own; and not beside one that shows nothing of it."""

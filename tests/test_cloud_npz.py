@@ -13,6 +13,8 @@ from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import open_source
 from piccolo.scan_map.map_file import FORMAT, is_map_file, load_map
 
+TIER = "scene"
+
 RAW = seeded_cloud(1, num_points=1200)
 XYZ, RGB = RAW.points_world, RAW.colors
 WHOLE = np.hstack([XYZ, RGB])

@@ -26,6 +26,8 @@ from piccolo.paper.localize import PaperSettings
 from piccolo.scan_map.open_map import CachePolicy, content_key, open_map
 from piccolo.scan_map.scan_map import prepare_map
 
+TIER = "scene"
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -253,6 +255,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
 """
 
 
+@pytest.mark.process
 def test_memory_grows_with_the_scene_and_not_with_the_points():
     peaks_mb = []
     for num_chunks in (2, 20):  # 0.5 and 5 million points, which would take 135 MB at once

@@ -28,6 +28,8 @@ from piccolo.photo import GpsPrior
 from piccolo.result_files import read_results
 from piccolo.views.zbuffer import nearest_depth, render_view, visible_points
 
+TIER = "scene"
+
 I = np.eye(3)  # noqa: E741
 HERE = np.zeros(3)
 BAD = {

@@ -25,6 +25,8 @@ from piccolo.result_files import read_results
 from piccolo.together.second_looks import follow_cameras, list_looks_by_focal
 from research.synthetic.world import render_picture
 
+TIER = "scene"
+
 GIVEN = 700.0
 
 

@@ -32,6 +32,8 @@ from piccolo.photo import Photo
 from piccolo.problem.method import METHOD
 from research.synthetic.world import render_picture
 
+TIER = "scene"
+
 
 def _photo(camera, yaw=0.0):
     this, pose = place(1)

@@ -17,6 +17,8 @@ from piccolo.together.group import localize_group
 from piccolo.together.links import FIRM, WEAK, Links, Placed, compute_shared, find_links, list_pairs, spread
 from piccolo.together.members import Shot
 
+TIER = "scene"
+
 
 def _sphere(num, seed):
     """Keypoints in random directions, that look like no others."""

@@ -30,6 +30,8 @@ from research.evaluation.query_result import read_run
 from research.scene import read_scene
 from research.synthetic.layout import LABEL_NAMES
 
+TIER = "scene"
+
 POINTS = seeded_cloud(1, num_points=3000).points_world
 LABELS = np.random.default_rng(2).integers(0, 21, 3000)
 READ = CloudSettings(labels=Labels())

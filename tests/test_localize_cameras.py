@@ -25,6 +25,8 @@ from piccolo.photo import Photo
 from piccolo.result_files import read_results
 from research.synthetic.world import photograph, picture_of_all, render_picture
 
+TIER = "scene"
+
 BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 FISHEYE = Camera("OPENCV_FISHEYE", 256, 256, (75.0, 75.0, 128.0, 128.0, 0.01, -0.003, 0.0, 0.0), 95.0)
 DUAL = (Mount(FISHEYE), Mount(FISHEYE, BACK, offset=(256, 0)))

@@ -22,6 +22,8 @@ from piccolo.judge.reasons import Reason
 from piccolo.localization import judging
 from research.synthetic.world import photograph, render_picture
 
+TIER = "scene"
+
 HERE = Pose(np.eye(3), np.zeros(3))
 
 

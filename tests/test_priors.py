@@ -20,6 +20,8 @@ from piccolo.cloud.stream import read_crs
 from piccolo.panorama.photo import GpsPosition, PhotoFacts, read_photo_facts
 from piccolo.photo import Photo, Prior
 
+TIER = "scene"
+
 
 @pytest.mark.parametrize(
     ("text", "message"),

@@ -33,6 +33,8 @@ from piccolo.judge.reasons import Reason
 from piccolo.report.pictures import pack_depth
 from research.synthetic.walk_frames import writing_video
 
+TIER = "scene"
+
 STOREYS = ["--storeys", "Ground floor", "First floor"]
 
 

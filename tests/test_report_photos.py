@@ -11,6 +11,8 @@ from report_scenes import HOSTILE, House, document_of, mixed_house, pictures_of
 from piccolo.cli import report
 from piccolo.report.site import collect_entries, shorten_names, unique_names
 
+TIER = "scene"
+
 
 @pytest.fixture(scope="module")
 def house(tmp_path_factory):

@@ -36,6 +36,8 @@ from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.zbuffer import visible_points
 from research.synthetic.world import scan_world
 
+TIER = "scene"
+
 APART = np.float32([6.0, 0.0, 0.0])  # [m] of a room and its twin
 SMALL = np.array([0.01, -0.02, 0.015, 0.05, -0.04, 0.03])  # [rad], [m]
 

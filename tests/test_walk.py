@@ -14,6 +14,8 @@ from piccolo.judge.result import nothing_found
 from piccolo.photo import Photo
 from piccolo.together.walk import tracker as tracker_module
 
+TIER = "scene"
+
 
 @pytest.fixture
 def folder():

@@ -22,6 +22,8 @@ from piccolo.result_files import read_results
 from piccolo.scan_walk import Walk
 from research.synthetic.walk_frames import writing_video
 
+TIER = "scene"
+
 
 @pytest.fixture
 def folder():

@@ -34,6 +34,8 @@ from piccolo.together.walk.following import (
 from piccolo.together.walk.frames import MOST_EXPECTED, Frame, Motion, State
 from piccolo.together.walk.places import list_key_states, narrow_down
 
+TIER = "scene"
+
 
 @pytest.fixture(scope="module")
 def seen():

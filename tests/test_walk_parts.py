@@ -27,6 +27,8 @@ from piccolo.together.walk.frames import MOST_ODDS, Frame, State, list_states
 from piccolo.together.walk.path import NOTHING, Ranked
 from piccolo.together.walk.results import check_odometry, make_localization, smooth_positions
 
+TIER = "scene"
+
 MAX_ACCELERATION = 0.5  # [m/s^2]
 MAX_SPEED = 2.0  # [m/s]
 TURN = exp_so3(np.array([0.1, -0.3, 1.0]))

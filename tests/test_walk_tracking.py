@@ -31,6 +31,8 @@ from piccolo.together.walk.following import (
 from piccolo.together.walk.frames import Frame, Motion, State
 from piccolo.together.walk.places import find_places, narrow_down
 
+TIER = "scene"
+
 
 @pytest.fixture
 def seen():
