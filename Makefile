@@ -1,5 +1,6 @@
 # make demo          set up, localize the photos of examples/flat, print the errors against the true poses, write a report
-# make test          set up, run every test but those of the report's page
+# make test          set up, run the tests that start no processes
+# make test-all      set up, run every test but those of the report's page
 # make test-kernels  set up, run the numerical tests once without compiling and once with array bounds checked
 # make test-browser  set up, run the tests of the report's page in Chromium (apt-get install chromium npm)
 # make test-wide     set up, try what photos and scans say wrongly of themselves; not in CI, some twenty minutes
@@ -11,7 +12,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-kernels test-browser test-wide check check-page clean
+.PHONY: demo test test-all test-kernels kernels-plain kernels-checked test-browser test-wide check check-page clean
 
 $(VENV)/ready: requirements.lock requirements-formats.lock requirements-gps.lock requirements-plans.lock requirements-colmap.lock requirements-serve.lock requirements-rerun.lock requirements-cluster.lock requirements-video.lock requirements-dev.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "found $$($(PYTHON) --version), wanted Python 3.11 or newer: make PYTHON=python3.11" >&2; exit 1; }
@@ -27,15 +28,24 @@ demo: $(VENV)/ready
 	$(BIN)/python tools/report.py --results demo/poses.jsonl --cloud examples/flat/cloud.ply --out demo/report --plan demo/plan.png --title "Sample flat"
 	@echo "Done: open demo/report/index.html in a browser; demo/overlay.png compares one photo with the scan."
 
+PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --max-worker-restart 0
+
 test: $(VENV)/ready
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --max-worker-restart 0
+	$(PYTEST) -m "not process"
+
+test-all: $(VENV)/ready
+	$(PYTEST)
 
 # of the tests of kernels, those that need seconds in plain Python
 KERNELS := channel_loss cone cloud_morton cloud_octree cloud_profiles p3p pose sampling_loss sphere zbuffer
 
-test-kernels: $(VENV)/ready
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -n auto --dist loadfile $(KERNELS:%=tests/test_%.py)
-	NUMBA_BOUNDSCHECK=1 $(BIN)/python -m pytest -n auto --dist loadfile $(KERNELS:%=tests/test_%.py)
+test-kernels: kernels-plain kernels-checked
+
+kernels-plain: $(VENV)/ready
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNELS:%=tests/test_%.py)
+
+kernels-checked: $(VENV)/ready
+	NUMBA_BOUNDSCHECK=1 $(BIN)/python -m pytest $(KERNELS:%=tests/test_%.py)
 
 test-wide: $(VENV)/ready
 	@mkdir -p demo

@@ -6,9 +6,11 @@ import threading
 
 import pytest
 import rooms
+import tiers
 from consistency import contradictions_of_line, find_contradictions, lines_of_results
 
 from piccolo.cloud.readers import e57, las, mesh, reader, text
+from piccolo.coloring import alignment
 from piccolo.files import cache
 from piccolo.jobs.memory import limit_memory
 from piccolo.judge.result import Result
@@ -33,6 +35,27 @@ SLOWEST = (
 def pytest_collection_modifyitems(items):
     order = {name: number for number, name in enumerate(SLOWEST)}
     items.sort(key=lambda item: order.get(item.path.name, len(order)))
+    for item in items:
+        tier = tiers.tier_of(item)
+        if not item.get_closest_marker(tier):
+            item.add_marker(tier)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def needed():
+    """The tiers that what was done needed, since they were last taken out."""
+    with pytest.MonkeyPatch.context() as patch:
+        yield tiers.watch(patch)
+
+
+@pytest.fixture(autouse=True)
+def _tier(request, needed):
+    """Fail a test that uses more than its tier may."""
+    yield
+    most = max(map(tiers.TIERS.index, needed), default=0)
+    needed.clear()
+    told = tiers.tier_of(request.node)
+    assert most <= tiers.TIERS.index(told), f"found a {told} test that needs the tier {tiers.TIERS[most]}"
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -110,6 +133,16 @@ def limiting():
     """Set the memory [GB] that this process may take, until the test ends."""
     yield limit_memory
     limit_memory(None)
+
+
+@pytest.fixture(scope="module")
+def coarse_colors():
+    """Photos that colour a scan are aligned by fewer points and pixels, which is enough for a room."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(alignment, "LEAST_ALIGNED_POINTS", 5000)
+        patch.setattr(alignment, "POINTS_PER_PHOTO", 0)
+        patch.setattr(alignment, "ALIGNMENT_WIDTHS", (512, 1024))
+        yield
 
 
 @pytest.fixture(scope="session")

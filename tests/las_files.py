@@ -6,9 +6,15 @@ import struct
 import laspy
 import lazrs
 import numpy as np
+from clouds import seeded_cloud
+
+from piccolo.cloud.readers.reader import RawCloud
 
 SCALES, OFFSETS = np.array([1e-3, 1e-4, 2e-3]), np.array([637_000.0, 5_849_000.0, -100.0])
 PLAIN_SIZE = {0: 20, 1: 28, 2: 26, 3: 34, 4: 57, 5: 63, 6: 30, 7: 36, 8: 38, 9: 59, 10: 67}
+ANYWHERE = seeded_cloud(2, num_points=1200)
+# Where the file's steps of SCALES put them.
+RAW = RawCloud(np.rint(ANYWHERE.points_world / SCALES) * SCALES + OFFSETS, ANYWHERE.colors)
 
 
 def las_bytes(raw, point_format=3, colors=None, withheld=None, extra_bytes=0, intensity=None, classes=None):

@@ -7,6 +7,7 @@ from io import BytesIO
 import cv2
 import numpy as np
 from PIL import Image
+from PIL.ExifTags import GPS, IFD, Base
 
 XMP_NAMESPACE = "http://ns.google.com/photos/1.0/panorama/"
 PNG_HEADER_SIZE = 33  # [byte] magic and IHDR
@@ -145,3 +146,22 @@ TURNS = {
     7: lambda image: np.swapaxes(np.rot90(image, 2), 0, 1),
     8: np.rot90,
 }
+
+
+def write_photo(path, rgb, position=None, accuracy=None, time=None):
+    """A JPEG with GPS (latitude, longitude) [deg] and a time of EXIF."""
+    exif = Image.Exif()
+    if position is not None:
+        gps = exif.get_ifd(IFD.GPSInfo)
+        tags = (GPS.GPSLatitude, GPS.GPSLatitudeRef, "NS"), (GPS.GPSLongitude, GPS.GPSLongitudeRef, "EW")
+        for value, (number, reference, letters) in zip(position, tags, strict=True):
+            degrees, rest = divmod(abs(value), 1.0)
+            minutes, rest = divmod(rest * 60.0, 1.0)
+            gps[number], gps[reference] = (degrees, minutes, rest * 60.0), letters[value < 0]
+        if accuracy is not None:
+            gps[GPS.GPSHPositioningError] = accuracy
+    if time is not None:
+        own = exif.get_ifd(IFD.Exif)
+        own[Base.DateTimeOriginal], own[Base.SubsecTimeOriginal], own[Base.OffsetTimeOriginal] = time
+    Image.fromarray(rgb).save(path, quality=95, exif=exif)
+    return path

@@ -67,3 +67,22 @@ def lines_of(path):
 
 def json_of(path):
     return json.loads(path.read_text(encoding="utf-8"))
+
+
+def covariance(rng, std=0.01):
+    """A covariance (6, 6) without symmetries."""
+    A = std * rng.normal(size=(6, 6))
+    return A @ A.T + std**2 * np.eye(6)
+
+
+def rotation(heading, pitch, roll):
+    """R_world_from_cam of angles in degrees: R_z(90 - heading) R_y(-pitch) R_x(roll)."""
+    z, y, x = np.radians([90.0 - heading, -pitch, roll])
+    return exp_so3(z * np.eye(3)[2]) @ exp_so3(y * np.eye(3)[1]) @ exp_so3(x * np.eye(3)[0])
+
+
+def assert_same_poses(found, expected):
+    assert len(found) == len(expected)
+    for pose, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(pose.R_cam_from_world, other.R_cam_from_world, atol=1e-12)
+        np.testing.assert_allclose(pose.center_world, other.center_world, atol=1e-12)

@@ -1,10 +1,14 @@
 """A made-up house of two storeys with photos, and results of all kinds, for tests of reports."""
 
+import base64
+import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
+from piccolo.cli import report
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.judge.pose_covariance import PoseCovariance
@@ -121,3 +125,27 @@ def mixed_house(folder, num_photos, width=256):
             house.add(k, confidence=0.9 + 0.099 * (k % 10) / 9)
     walk = house.write_results("walk.jsonl", house.add_walk(6))
     return house, [house.write_results(), walk]
+
+
+def run_report(house, out, *more):
+    house, results = house
+    words = ["--results", *map(str, results), "--cloud", str(house.cloud), "--quiet", "--jobs", "2"]
+    return report.main([*words, "--out", str(out), *more])
+
+
+def document_of(out):
+    text = (out / "report.js").read_text()
+    return json.loads(text.removeprefix("window.PICCOLO_REPORT = ").removesuffix(";\n"))
+
+
+def photo_named(document, name):
+    return next(photo for photo in document["photos"] if photo["name"] == name)
+
+
+def pictures_of(out, photo):
+    text = (out / "photos" / f"{photo['key']}.js").read_text()
+    return json.loads(text.partition(" = ")[2].removesuffix(";\n"))
+
+
+def decode_picture(text):
+    return cv2.imdecode(np.frombuffer(base64.b64decode(text), np.uint8), cv2.IMREAD_COLOR)

@@ -13,12 +13,14 @@ from plyfile import PlyData, PlyElement
 from poses import tilted_poses
 from rooms import query as read_photo_facts
 from scans import bare_room, points_of, scan, write_scan
-from test_cloud_ptx import scan as ptx_lines, write as write_lines
+from text_files import scan as ptx_lines, write_lines
 
 from piccolo.cli import align_gravity
 from piccolo.geometry.pose import exp_so3, transform_points
 from research.datasets import true_poses
 from research.scene import Query, read_scene, write_queries
+
+TIER = "scene"
 
 ROOT = Path(__file__).resolve().parents[1]
 TURN = np.array([1.4, 0.6, -0.3])
@@ -166,6 +168,7 @@ def test_a_cloud_without_colours_gets_none(run, tmp_path):
         (tmp_path / "out.ply").unlink()
 
 
+@pytest.mark.process
 def test_same_bits_every_run_and_for_every_thread_count(run, tilted, tmp_path):
     outs = [tmp_path / f"{k}.ply" for k in range(2)]
     assert run("--cloud", tilted, "--out", outs[0], "--yaw-walls", FREE)[0] == 0

@@ -129,6 +129,7 @@ def test_stdout_gets_bytes(name, capfdbinary):
     assert not Path("-").exists()
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(("redirection", "found"), [("> out", "1\n2\n3\n"), (">&-", "found a closed stdout")])
 def test_stdout_redirected_keeps_what_is_printed_around_it(tmp_path, redirection, found):
     code = "from piccolo.files.atomic import *; print(1); write_atomically(Path('-'), b'2\\n'); print(3)"
@@ -146,6 +147,7 @@ def test_devices_are_written_to_and_a_full_one_is_named():
     assert Path("/dev/full").is_char_device()
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(("out", "why"), [("link.csv", "File too large"), ("-", "No space left on device")])
 def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, out, why):
     """A limit to the size of files stands for the disk, /dev/full for stdout."""
@@ -162,6 +164,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, out, why):
     assert names(tmp_path) == ["link.csv", "p.csv", "r.jsonl"]
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_leaves_nothing(tmp_path, number, code):
     def run(arguments):
@@ -275,6 +278,7 @@ with open_locked(Path(sys.argv[1])) as file:
 """
 
 
+@pytest.mark.process
 def test_the_lock_of_a_killed_process_is_free(tmp_path):
     out = tmp_path / "poses.jsonl"
     with subprocess.Popen([sys.executable, "-c", HOLD, out], cwd=ROOT, stdout=subprocess.PIPE) as process:
@@ -299,6 +303,7 @@ def test_lines_are_rearranged_and_more_follow(tmp_path):
     assert out.read_text() == "c\na\nd\n"
 
 
+@pytest.mark.process
 def test_a_full_disk_keeps_the_lines_before(tmp_path):
     out = tmp_path / "poses.jsonl"
     code = """

@@ -30,6 +30,8 @@ from piccolo.problem.problem import Features
 from piccolo.problem.settings import CoarseToFineSettings, Effort
 from research.synthetic.world import mask_outside_field
 
+TIER = "scene"
+
 EFFORT = rooms.KNOWN.effort
 NO_FEATURES = Once(lambda workers: Features(join_keypoints([]), NO_MATCHES))
 

@@ -20,6 +20,8 @@ from piccolo.errors import InputError
 from piccolo.result_files import read_results
 from research.scene import read_scene
 
+TIER = "scene"
+
 
 @pytest.fixture
 def out(tmp_path):
@@ -323,6 +325,7 @@ def test_files_left_out_are_counted_and_links_to_folders_searched(scene, tmp_pat
         list(list_panoramas([str(tmp_path / "few")], None, Counter()))
 
 
+@pytest.mark.process
 def test_a_signal_ends_a_batch_after_the_photo_at_work(scene, out):
     name = str(scene / "images" / "clean_0.jpg")
     words = ["--cloud", str(scene / "cloud.ply"), "--pano", *[name] * 30, "--out", str(out)]

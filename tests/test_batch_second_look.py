@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 import rooms
 from batches import untimed
+from camera_room import SEED, place
 from pictures import encoded, write
 from poses import judged
-from test_localize_cameras import SEED, place
 
 from piccolo import open_scan, second_look
 from piccolo.batch.localizer import Localizer
@@ -40,6 +40,8 @@ from piccolo.scan import Scan
 from piccolo.second_look import Looking
 from piccolo.together.second_looks import MOST_PICTURES, Look, list_looks_beside, localize_in_order
 from research.synthetic.world import render_picture
+
+TIER = "scene"
 
 PHONE = (Mount(pinhole(1024, 512, 400.0)),)
 NONE_ASKED = Beside((), "0" * 64)

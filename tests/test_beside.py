@@ -3,10 +3,10 @@
 import functools
 from dataclasses import replace
 
+import narrow_photo
 import numpy as np
 import pytest
 import rooms
-from test_verification import NUM_POINTS, _beside, _narrow, _problem, _true_pose
 
 from piccolo.evidence import verification
 from piccolo.evidence.focal_length import FocalFit
@@ -23,14 +23,16 @@ from piccolo.localization.judging import Found
 from piccolo.photo import Prior
 from piccolo.together.beside import Neighbor, SurePhoto, fuse, localize_beside
 
+TIER = "scene"
+
 
 def test_a_photo_is_localized_beside_one_that_shows_the_same():
     """Without a pose of its own; and not beside one that shows nothing of it."""
-    panorama = _narrow()[0]
-    nothing = replace_keypoints(_beside(), np.arange(3))
-    ask = functools.partial(localize_beside, rooms.scan_map(1, NUM_POINTS), panorama, [])
+    panorama = narrow_photo.take()[0]
+    nothing = replace_keypoints(narrow_photo.beside(), np.arange(3))
+    ask = functools.partial(localize_beside, rooms.scan_map(1, narrow_photo.NUM_POINTS), panorama, [])
     found, names = ask(
-        {"bare": SurePhoto(nothing, 0.99, None), "beside": SurePhoto(_beside(), 0.97, None)},
+        {"bare": SurePhoto(nothing, 0.99, None), "beside": SurePhoto(narrow_photo.beside(), 0.97, None)},
         rooms.UNKNOWN,
         Workers(2),
         Stopwatch(),
@@ -40,7 +42,7 @@ def test_a_photo_is_localized_beside_one_that_shows_the_same():
     assert found.confidence <= 0.97
     assert found.probability_none == pytest.approx(1.0 - found.confidence, abs=0.01)
     assert found.evidence.num_matches >= 20
-    assert rooms.errors(found.pose, _narrow()[1])[0] < 0.03
+    assert rooms.errors(found.pose, narrow_photo.take()[1])[0] < 0.03
     assert ask({"bare": SurePhoto(nothing, 0.99, None)}, rooms.UNKNOWN, Workers(2), Stopwatch()) == (
         nothing_found(),
         (),
@@ -71,7 +73,7 @@ def _matches_of(pose, noise, rng, count=60):
 @pytest.mark.parametrize(("noise", "count"), [(4e-3, 12), (4e-3, 60)])
 def test_the_covariance_of_matches_is_that_of_poses_found_by_them(noise, count):
     rng = np.random.default_rng(3)
-    true = _true_pose()
+    true = narrow_photo.true_pose()
     squares = []
     for _ in range(100):
         matches = _matches_of(true, noise, rng, count)
@@ -88,15 +90,17 @@ def _at(pose, std):
 
 def _fused(judged, of_photo, settings=rooms.UNKNOWN, fit=None):
     """The mean of a result's pose and that by a photo beside, at the true pose."""
-    matches = _matches_of(_true_pose(), 1e-3, np.random.default_rng(1))
-    located = verification.Located(_beside().keypoints, _beside().ranges, of_photo.pose)
-    other = Neighbor("b", SurePhoto(located, 0.99, of_photo), matches, _true_pose())
-    return fuse(judged, other, Found(replace(_problem(), prior=settings.prior), NO_CHOICE, fit))
+    matches = _matches_of(narrow_photo.true_pose(), 1e-3, np.random.default_rng(1))
+    located = verification.Located(
+        narrow_photo.beside().keypoints, narrow_photo.beside().ranges, of_photo.pose
+    )
+    other = Neighbor("b", SurePhoto(located, 0.99, of_photo), matches, narrow_photo.true_pose())
+    return fuse(judged, other, Found(replace(narrow_photo.problem(), prior=settings.prior), NO_CHOICE, fit))
 
 
 def test_a_pose_is_averaged_with_that_by_a_photo_beside():
     """By their covariances; not if it is ruled out, nor against a prior."""
-    true = _true_pose()
+    true = narrow_photo.true_pose()
     off = Pose(true.R_cam_from_world, true.center_world + np.array([0.09, 0.0, 0.0]))
     judged = Result(belief=make_belief([0.8]), best_pose=off, gaussian=_at(off, 0.05))
     fused = _fused(judged, _at(true, 0.01))
@@ -109,7 +113,7 @@ def test_a_pose_is_averaged_with_that_by_a_photo_beside():
     assert apart.largest_std == pytest.approx(0.01 * (excess / 2.0) ** 0.5, rel=0.1)
     assert _fused(replace(judged, belief=judged.belief.rule_out(Reason.MIRRORED)), _at(true, 0.01)) is None
     assert _fused(replace(judged, gaussian=None), _at(true, 0.01)) is None
-    here = rooms.scan_map(1, NUM_POINTS).to_world(true).center_world
+    here = rooms.scan_map(1, narrow_photo.NUM_POINTS).to_world(true).center_world
     away = replace(rooms.UNKNOWN, prior=Prior(near=(*(here[:2] + 5.0), None), radius=0.5))
     assert _fused(judged, _at(true, 0.01), away) is None
     motion = np.zeros((6, 1))

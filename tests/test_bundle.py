@@ -33,6 +33,8 @@ from piccolo.together.bundle import (
 )
 from piccolo.together.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
 
+TIER = "scene"
+
 NEAR = np.array([2.0, -1.0, 0.5])
 SEED = 5
 ERRORS = RelativeErrors()

@@ -4,9 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from poses import tilted_poses
+from poses import covariance, tilted_poses
 from scipy.special import chdtri
-from test_pose import covariance
 
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add, subtract

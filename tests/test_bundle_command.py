@@ -18,6 +18,8 @@ from piccolo.photo import Photo
 from piccolo.result_files import read_results
 from research.scene import read_scene
 
+TIER = "scene"
+
 COMMON_FROM_WORLD = Pose(exp_so3(np.array([0.3, -0.2, 2.0])), np.array([3.0, -1.0, 2.0]))
 NAMES = ("clean_2.jpg", "clean_0.jpg", "clean_1.jpg")  # in another order than in the files
 

@@ -265,6 +265,7 @@ def test_who_waits_for_kernels_is_told(monkeypatch, capsys):
     assert logging.getLogger("piccolo").level == logging.NOTSET
 
 
+@pytest.mark.process
 def test_importing_writes_nothing(tmp_path):
     folders = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
     environment = {**os.environ, **folders, "PYTHONDONTWRITEBYTECODE": "1"}
@@ -298,6 +299,7 @@ def test_a_folder_is_removed_at_the_end_and_after_an_error(temporary_folders):
     assert temporary_folders() == []
 
 
+@pytest.mark.process
 def test_what_a_killed_process_left_is_removed_and_what_a_living_one_has_stays(temporary_folders, temporary):
     command = [sys.executable, "-c", HOLD]
     where = os.environ | {"TMPDIR": str(temporary)}

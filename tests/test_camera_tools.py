@@ -22,6 +22,8 @@ from research.scene import read_scene
 from research.synthetic import make_room
 from research.synthetic.world import make_world, photograph, pose_of_query, render_picture
 
+TIER = "scene"
+
 WIDE = Camera("OPENCV", 480, 400, (150.0, 152.0, 245.0, 198.0, -0.02, 0.001, 1e-3, -1e-3))
 TURN = tuple(map(tuple, exp_so3(np.radians([0.0, 0.0, 90.0])).tolist()))
 RIG = (Mount(pinhole(240, 240, 110.0), image="a.jpg"), Mount(pinhole(240, 240, 110.0), TURN, image="b.png"))

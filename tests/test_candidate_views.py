@@ -17,6 +17,8 @@ from piccolo.views.candidate_views import SEARCH_VIEW, CandidateViews, render_vi
 from piccolo.views.points_around import visible_points
 from piccolo.views.view import average_view
 
+TIER = "scene"
+
 ALL = np.ones(len(make_grid(24)), bool)
 
 

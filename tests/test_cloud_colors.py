@@ -4,10 +4,10 @@ import itertools
 
 import numpy as np
 import pytest
+from clouds import seeded_cloud, whole
 from plyfile import PlyData, PlyElement
 from refusals import assert_refused
 from scans import read_cloud
-from test_cloud_morton import seeded_cloud, whole
 
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
 from piccolo.cloud.stream import open_source, stream_of_arrays

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_cloud_morton import whole
+from clouds import whole
 
 from piccolo.cloud.readers.text_columns import name_columns
 from piccolo.cloud.settings import CloudSettings

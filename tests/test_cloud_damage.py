@@ -9,19 +9,16 @@ import zlib
 import meshes as made
 import numpy as np
 import pytest
+from clouds import read, whole
 from hypothesis import given, settings, strategies as st
-from las_files import las_bytes, laz_bytes
+from las_files import RAW, las_bytes, laz_bytes
 from meshes import CORNER_COLORS, SQUARE, Gltf, change, obj_text, textured_gltf, write_obj, write_ply
+from pcd_files import COLORS, ENCODINGS, content_of
+from ply_files import vertices
 from plyfile import PlyData
 from refusals import assert_input_error, assert_refused, mutated, read_or_refused
 from scans import read_cloud
-from test_cloud_las import RAW
-from test_cloud_morton import read, whole
-from test_cloud_npz import PAIR, WHOLE
-from test_cloud_pcd import COLORS, ENCODINGS, content_of
-from test_cloud_ply import vertices
-from test_cloud_ptx import TWO_SCANS, pts
-from test_cloud_text import lines_of
+from text_files import TWO_SCANS, lines_of, pts
 
 from piccolo.cloud.readers import mesh_files
 from piccolo.cloud.readers.mesh import open_mesh
@@ -29,6 +26,7 @@ from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.stream import open_cloud, open_source
 
 SMALL = RawCloud(RAW.points_world[:60], RAW.colors[:60])
+PAIR = {"points": RAW.points_world, "colors": RAW.colors}
 
 
 def written(write, *arguments, **options):
@@ -48,7 +46,7 @@ CONTENTS = {
     **{f"{encoding}.pcd": content_of(COLORS["uint rgb"], encoding) for encoding in ENCODINGS},
     "binary.ply": ply(byte_order=">"),
     "text.ply": ply(text=True),
-    "a.npy": written(np.save, WHOLE),
+    "a.npy": written(np.save, np.hstack([RAW.points_world, RAW.colors])),
     "a.npz": written(np.savez, **PAIR),
     "packed.npz": written(np.savez_compressed, **PAIR),
     "a.ptx": "\n".join(TWO_SCANS).encode(),

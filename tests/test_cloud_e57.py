@@ -3,11 +3,11 @@ import sys
 
 import numpy as np
 import pytest
+from clouds import read, seeded_cloud
 from e57_files import ImageToWrite, ScanToWrite, sealed, with_xml, write
 from hypothesis import given, settings, strategies as st
 from refusals import assert_refused, mutated, read_or_refused
 from scans import read_cloud
-from test_cloud_morton import read, seeded_cloud
 
 from piccolo.camera.photo_cameras import find_calibration
 from piccolo.cli import e57_images

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from clouds import seeded_cloud, whole
 from e57_files import ScanToWrite, write as write_e57
 from las_files import OFFSETS, las_bytes, laz_bytes
+from pcd_files import content_of
 from refusals import assert_refused
 from scans import write_scalars
-from test_cloud_morton import seeded_cloud, whole
-from test_cloud_pcd import content_of
 
 from piccolo.cloud.readers.e57 import open_e57
 from piccolo.cloud.readers.las import open_las

@@ -3,19 +3,15 @@ import sys
 
 import numpy as np
 import pytest
-from las_files import OFFSETS, SCALES, las_bytes, laz_bytes
+from clouds import read
+from las_files import RAW, las_bytes, laz_bytes
 from refusals import assert_refused
-from test_cloud_morton import read, seeded_cloud
 
 from piccolo.cloud.readers import las
-from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import open_source
 from piccolo.errors import InputError
 
-RAW = seeded_cloud(2, num_points=1200)
-# Where the file's steps of SCALES put them.
-RAW = RawCloud(np.rint(RAW.points_world / SCALES) * SCALES + OFFSETS, RAW.colors)
 FORMATS = [2, 3, 5, 7, 8, 10]
 EIGHT_BIT = RAW.colors.astype(np.uint16)
 INTENSITY = np.where(np.arange(1200) == 1000, 7, 0).astype(np.uint16)  # of one point

@@ -2,11 +2,11 @@ import meshes as made
 import numpy as np
 import pytest
 import trimesh
+from clouds import whole
 from PIL import Image
 from refusals import assert_refused
 from scans import read_cloud
 from scipy.spatial.transform import Rotation
-from test_cloud_morton import whole
 
 from piccolo.cloud.readers import mesh as mesh_module, mesh_files
 from piccolo.cloud.readers.mesh import compute_weights, look_up, open_mesh

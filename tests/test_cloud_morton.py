@@ -3,41 +3,19 @@ from pathlib import Path
 
 import naive
 import numpy as np
+from clouds import seeded_cloud
 from hypothesis import given, settings, strategies as st
 
 from piccolo.cloud.readers.reader import PointSource, RawCloud
-from piccolo.cloud.settings import IN_COLORS
-from piccolo.cloud.stream import Cloud, CloudStream, open_source
+from piccolo.cloud.stream import Cloud, CloudStream
 from piccolo.cloud.voxels import morton_codes, morton_order
 
 A = Path("a")
 
 
-def seeded_cloud(seed, num_points=1500, size=(6.0, 5.0, 2.5), step=0.0):
-    """Points in a box, float64, and colours; snapped to a grid of `step` if given, so that many coincide."""
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(-0.5, 0.5, (num_points, 3)) * size
-    if step:
-        points = np.round(points / step) * step
-    return RawCloud(points, rng.integers(0, 256, (num_points, 3), dtype=np.uint8))
-
-
 def clean(path, raw, scale):
     """The cloud of points in memory as if they had been read from a file."""
     return CloudStream([PointSource(path, lambda: iter([raw]), units=(scale,) * 3)]).read()
-
-
-def whole(open_file, path, options=IN_COLORS, *channel):
-    """All points that a reader finds in a file."""
-    none = RawCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    chunks = list(open_file(path, options, *channel).read_chunks()) or [none]
-    return RawCloud(*(np.concatenate(arrays) for arrays in zip(*chunks, strict=True)))
-
-
-def read(path):
-    """Points (N, 3) and colours (N, 3) of a file, by the reader that its content asks for."""
-    raw = whole(open_source, path)
-    return raw.points_world, raw.colors
 
 
 def same_bits(a: Cloud, b: Cloud):

@@ -4,14 +4,16 @@ import zipfile
 
 import numpy as np
 import pytest
+from clouds import read, seeded_cloud
 from refusals import assert_refused
 from scans import read_cloud
-from test_cloud_morton import read, seeded_cloud
 
 from piccolo.cloud.readers import npz
 from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import open_source
 from piccolo.scan_map.map_file import FORMAT, is_map_file, load_map
+
+TIER = "scene"
 
 RAW = seeded_cloud(1, num_points=1200)
 XYZ, RGB = RAW.points_world, RAW.colors

@@ -6,9 +6,8 @@ import naive
 import numpy as np
 import pytest
 import rooms
+from clouds import LEVEL, TURN, seeded_cloud, stream
 from scipy.spatial import cKDTree
-from test_cloud_morton import seeded_cloud
-from test_cloud_stream import LEVEL, TURN, stream
 
 from piccolo.cloud import octree as octree_module, voxels as voxel_table
 from piccolo.cloud.octree import MAX_NODES, build_octree, collect

@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rooms
+from clouds import whole
+from ply_files import RAW, RGB, vertices, write
 from plyfile import PlyData, PlyElement
 from refusals import assert_input_error, assert_refused
 from scans import read_cloud
-from test_cloud_morton import seeded_cloud, whole
 
 from piccolo.cloud.readers import ply
 from piccolo.cloud.readers.ply import open_ply
@@ -18,25 +19,8 @@ from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.writers import coordinate_type, vertex_rows, writing_ply
 from piccolo.errors import InputError
 
-RAW = seeded_cloud(1, num_points=1200)
-RGB = ("red", "green", "blue")
 FACES = np.array([([0, 1, 2],), ([2, 3, 4],)], dtype=[("vertex_indices", "i4", (3,))])
 TRIANGLES = PlyElement.describe(FACES, "strip")
-
-
-def vertices(raw=RAW, coordinate="f4", color="u1", names=RGB, brightest=255, extra=()):
-    """The vertex element of a cloud; `extra` names float properties put first."""
-    fields = [*((n, "f4") for n in extra), *((n, coordinate) for n in "xyz"), *((n, color) for n in names)]
-    table = np.zeros(len(raw.colors), dtype=fields)
-    for k in range(3):
-        table["xyz"[k]] = raw.points_world[:, k]
-        table[names[k]] = raw.colors[:, k] * (brightest / 255)
-    return PlyElement.describe(table, "vertex")
-
-
-def write(path, *elements, text=False, byte_order="<", comments=()):
-    PlyData(list(elements), text=text, byte_order=byte_order, comments=list(comments)).write(str(path))
-    return path
 
 
 def content_of(tmp_path, **options):

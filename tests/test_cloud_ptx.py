@@ -1,52 +1,14 @@
-import math
-
 import numpy as np
 import pytest
+from clouds import read
 from refusals import assert_input_error, assert_refused
 from scans import read_cloud
-from test_cloud_morton import read, seeded_cloud
-from test_cloud_text import write
+from text_files import RAW, THERE, TWO_SCANS, pts, scan, write_lines
 
 from piccolo.cloud.readers import text
 from piccolo.cloud.readers.text import line_blocks, open_ptx, open_text
 from piccolo.cloud.stream import open_source
 from piccolo.errors import InputError
-
-RAW = seeded_cloud(1, num_points=1200)
-
-
-def placed(yaw, pitch, translation):
-    """A PTX matrix: for row vectors, the rotation transposed above the translation."""
-    c, s = math.cos(yaw), math.sin(yaw)
-    about_z = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    c, s = math.cos(pitch), math.sin(pitch)
-    matrix = np.eye(4)
-    matrix[:3, :3] = (about_z @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])).T
-    matrix[3, :3] = translation
-    return matrix
-
-
-HERE = placed(0.7, 0.3, [12.5, -3.0, 1.75])
-THERE = placed(-2.1, -0.8, [637_012.25, 5_849_028.5, 431.125])
-
-
-def points_of(points_world, colors, intensity="0.5 "):
-    rows = zip(points_world.tolist(), colors.tolist(), strict=True)
-    return [f"{x!r} {y!r} {z!r} {intensity}{r} {g} {b}" for (x, y, z), (r, g, b) in rows]
-
-
-def in_scanner(points_world, matrix):
-    return (points_world - matrix[3, :3]) @ np.linalg.inv(matrix[:3, :3])
-
-
-def scan(points_world, colors, matrix=HERE, count=None):
-    header = [*np.vstack([matrix[3, :3], matrix[:3, :3]]), *matrix]
-    return [
-        f"{len(colors) if count is None else count}",
-        "1",
-        *(" ".join(map(repr, line.tolist())) for line in header),
-        *points_of(in_scanner(points_world, matrix), colors),
-    ]
 
 
 def assert_read_as_written(path, raw_cloud=RAW, atol=1e-12):
@@ -55,24 +17,20 @@ def assert_read_as_written(path, raw_cloud=RAW, atol=1e-12):
     np.testing.assert_array_equal(colors, raw_cloud.colors)
 
 
-TWO_SCANS = [
-    *scan(RAW.points_world[:500], RAW.colors[:500], HERE),
-    *scan(RAW.points_world[500:], RAW.colors[500:], THERE),
-]
-
-
 def test_scanners_with_a_place_tell_their_z_axis(tmp_path):
     lines = [*scan(RAW.points_world, RAW.colors, THERE), *scan(RAW.points_world, RAW.colors, np.eye(4))]
-    (axis,) = open_ptx(write(tmp_path / "a.ptx", lines)).station_axes
+    (axis,) = open_ptx(write_lines(tmp_path / "a.ptx", lines)).station_axes
     np.testing.assert_allclose(axis, THERE[2, :3], atol=1e-12)
     doubled = THERE * np.array([[2.0], [2.0], [2.0], [1.0]])  # a matrix that scales
-    (axis,) = open_ptx(write(tmp_path / "a.ptx", scan(RAW.points_world, RAW.colors, doubled))).station_axes
+    (axis,) = open_ptx(
+        write_lines(tmp_path / "a.ptx", scan(RAW.points_world, RAW.colors, doubled))
+    ).station_axes
     np.testing.assert_allclose(axis, THERE[2, :3], atol=1e-12)
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
 def test_scans_are_put_in_the_world(tmp_path, end):
-    path = write(tmp_path / "a.ptx", TWO_SCANS, end)
+    path = write_lines(tmp_path / "a.ptx", TWO_SCANS, end)
     assert_read_as_written(path, atol=1e-8)
     assert open_source(path).num_points == 1200
     assert open_source(path).warnings == ()
@@ -80,16 +38,20 @@ def test_scans_are_put_in_the_world(tmp_path, end):
 
 def test_large_coordinates_keep_their_digits_without_points_that_did_not_return(tmp_path):
     far = type(RAW)(RAW.points_world + THERE[3, :3], RAW.colors)
-    assert_read_as_written(write(tmp_path / "a.ptx", scan(far.points_world, far.colors, THERE)), far, 2e-9)
+    assert_read_as_written(
+        write_lines(tmp_path / "a.ptx", scan(far.points_world, far.colors, THERE)), far, 2e-9
+    )
     lines = scan(RAW.points_world, RAW.colors, count=1202)
-    path = write(tmp_path / "a.ptx", [*lines[:100], "0 0 0 0.5 9 9 9", *lines[100:], "0.0 -0.0 0 0 0 0 0"])
+    path = write_lines(
+        tmp_path / "a.ptx", [*lines[:100], "0 0 0 0.5 9 9 9", *lines[100:], "0.0 -0.0 0 0 0 0 0"]
+    )
     assert_read_as_written(path)
-    assert_read_as_written(write(tmp_path / "a.txt", TWO_SCANS), atol=1e-8)
+    assert_read_as_written(write_lines(tmp_path / "a.txt", TWO_SCANS), atol=1e-8)
 
 
 @pytest.mark.parametrize("chunk", [1, 3, 499, 500, 501])
 def test_chunk_size_changes_nothing(tmp_path, read_by, chunk):
-    path = write(tmp_path / "a.ptx", TWO_SCANS)
+    path = write_lines(tmp_path / "a.ptx", TWO_SCANS)
     whole = read(path)
     read_by(chunk)
     assert max(len(part.colors) for part in open_source(path).read_chunks()) == chunk
@@ -100,7 +62,7 @@ def test_chunk_size_changes_nothing(tmp_path, read_by, chunk):
 def test_a_header_that_promises_too_much(tmp_path):
     lines = scan(RAW.points_world, RAW.colors, count=999_999_999)
     lines[1] = "999999999"
-    path = write(tmp_path / "a.ptx", lines)
+    path = write_lines(tmp_path / "a.ptx", lines)
     assert_read_as_written(path)
     source = open_source(path)
     assert source.num_points == 1200
@@ -108,12 +70,14 @@ def test_a_header_that_promises_too_much(tmp_path):
 
 
 def test_a_line_that_may_be_cut_off_is_not_read_and_infinite_points_are(tmp_path):
-    path = write(tmp_path / "a.ptx", [*TWO_SCANS, *scan(RAW.points_world[:9], RAW.colors[:9], count=10)])
+    path = write_lines(
+        tmp_path / "a.ptx", [*TWO_SCANS, *scan(RAW.points_world[:9], RAW.colors[:9], count=10)]
+    )
     path.write_bytes(path.read_bytes()[:-2])
     assert len(read(path)[1]) == 1208
     assert "promises 10 points, found 8" in open_source(path).warnings[0]
     lines = [*scan(RAW.points_world, RAW.colors, count=1202), "nan 1 2 0 1 2 3", "inf 1e308 1e308 0 1 2 3"]
-    assert "2 points with NaN" in read_cloud(write(tmp_path / "a.ptx", lines)).warnings[0]
+    assert "2 points with NaN" in read_cloud(write_lines(tmp_path / "a.ptx", lines)).warnings[0]
 
 
 @pytest.mark.parametrize(
@@ -133,22 +97,18 @@ def test_broken_lines_are_named(tmp_path, read_by, number, line, message):
     read_by(64)
     lines = [*scan(RAW.points_world, RAW.colors), *scan(RAW.points_world[:5], RAW.colors[:5])]
     lines[number - 1 : number] = [] if line is None else [line]
-    path = write(tmp_path / "a.ptx", lines)
+    path = write_lines(tmp_path / "a.ptx", lines)
     assert_refused(message, read, path)
-
-
-def pts(intensity="-1613 ", raw_cloud=RAW):
-    return points_of(raw_cloud.points_world, raw_cloud.colors, intensity)
 
 
 @pytest.mark.parametrize("intensity", ["", "-1613 ", "0.25 "])
 def test_columns_of_pts(tmp_path, intensity):
-    assert_read_as_written(write(tmp_path / "a.pts", ["1200", *pts(intensity)]))
-    assert_read_as_written(write(tmp_path / "b.pts", pts(intensity)))
+    assert_read_as_written(write_lines(tmp_path / "a.pts", ["1200", *pts(intensity)]))
+    assert_read_as_written(write_lines(tmp_path / "b.pts", pts(intensity)))
 
 
 def test_further_columns_of_pts_are_passed_over(tmp_path):
-    assert_read_as_written(write(tmp_path / "a.pts", [line + " 0 0 1" for line in pts()]))
+    assert_read_as_written(write_lines(tmp_path / "a.pts", [line + " 0 0 1" for line in pts()]))
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 400, 1 << 20])
@@ -156,7 +116,7 @@ def test_counts_stand_between_scans_of_pts(tmp_path, read_by, chunk):
     read_by(chunk)
     lines = pts()
     lines = ["", "400", *lines[:400], "0", "800", *lines[400:], "", "0"]
-    assert_read_as_written(write(tmp_path / "a.pts", lines))
+    assert_read_as_written(write_lines(tmp_path / "a.pts", lines))
 
 
 @pytest.mark.parametrize(
@@ -174,7 +134,7 @@ def test_counts_stand_between_scans_of_pts(tmp_path, read_by, chunk):
     ],
 )
 def test_broken_pts_are_refused(tmp_path, lines, message):
-    path = write(tmp_path / "a.pts", lines)
+    path = write_lines(tmp_path / "a.pts", lines)
     assert_refused(message, read, path)
 
 
@@ -182,9 +142,9 @@ def test_empty_files_and_scans_that_have_gone_between_two_readings_are_refused(t
     (tmp_path / "a").touch()
     for reader in (open_ptx, open_text):
         assert_refused("no line of numbers.*, wanted", reader, tmp_path / "a")
-    path = write(tmp_path / "a.ptx", TWO_SCANS)
+    path = write_lines(tmp_path / "a.ptx", TWO_SCANS)
     source = open_source(path)
-    write(path, TWO_SCANS[:300])
+    write_lines(path, TWO_SCANS[:300])
     assert_input_error("found 290 of 500 points; the file is cut off", lambda: list(source.read_chunks()))
 
 
@@ -197,7 +157,7 @@ def test_a_file_cut_while_it_is_read_is_refused(tmp_path, read_by, name, gray):
     if gray:
         fields = [line.split() for line in lines]
         lines = [" ".join([*f[:3], str(k)] if len(f) == 7 else f) for k, f in enumerate(fields)]
-    path = write(tmp_path / name, lines)
+    path = write_lines(tmp_path / name, lines)
     chunks = open_source(path).read_chunks()
     next(chunks)
     content = path.read_bytes()
@@ -219,8 +179,8 @@ def test_many_small_scans_are_read_once(tmp_path, monkeypatch):
 
     monkeypatch.setattr(text, "line_blocks", counted)
     small = [scan(RAW.points_world[k : k + 3], RAW.colors[k : k + 3]) for k in range(0, 1200, 3)]
-    path = write(tmp_path / "a.ptx", [line for lines in small for line in lines])
+    path = write_lines(tmp_path / "a.ptx", [line for lines in small for line in lines])
     assert_read_as_written(path)
     counts = [line for k in range(0, 1200, 3) for line in ("3", *pts()[k : k + 3])]
-    assert_read_as_written(write(tmp_path / "a.pts", counts))
+    assert_read_as_written(write_lines(tmp_path / "a.pts", counts))
     assert len(blocks) == 4  # each file when it is opened and when it is read

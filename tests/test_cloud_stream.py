@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rooms
+from clouds import LEVEL, TURN, part, seeded_cloud, stream
 from plyfile import PlyData, PlyElement
 from refusals import assert_input_error
 from rooms import room
-from test_cloud_morton import seeded_cloud
 
 from piccolo.cloud.readers.reader import PointSource, RawCloud
 from piccolo.cloud.settings import METRES, WITHOUT_COLORS, CloudSettings
@@ -26,23 +26,9 @@ from piccolo.paper.localize import PaperSettings
 from piccolo.scan_map.open_map import CachePolicy, content_key, open_map
 from piccolo.scan_map.scan_map import prepare_map
 
+TIER = "scene"
+
 ROOT = Path(__file__).resolve().parents[1]
-TURN = exp_so3(np.array([0.3, -0.7, 1.9]))
-LEVEL = np.eye(3)
-
-
-def part(raw, indices):
-    return RawCloud(raw.points_world[indices], raw.colors[indices])
-
-
-def stream(*raws, chunk=10**9, scale=1.0):
-    """A cloud of as many files, each handed on in chunks."""
-
-    def source(k, raw):
-        chunks = [part(raw, slice(lo, lo + chunk)) for lo in range(0, len(raw.colors), chunk)]
-        return PointSource(Path(f"{k}.ply"), lambda: iter(chunks), len(raw.colors), units=(scale,) * 3)
-
-    return CloudStream([source(k, raw) for k, raw in enumerate(raws)])
 
 
 FAR = np.array([500_000.0, 5_400_000.0, 100.0])  # UTM
@@ -269,6 +255,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
 """
 
 
+@pytest.mark.process
 def test_memory_grows_with_the_scene_and_not_with_the_points():
     peaks_mb = []
     for num_chunks in (2, 20):  # 0.5 and 5 million points, which would take 135 MB at once

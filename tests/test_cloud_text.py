@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
+from clouds import read, seeded_cloud, whole
 from hypothesis import given, strategies as st
+from ply_files import vertices, write as write_ply
 from plyfile import PlyElement
 from refusals import assert_refused
 from scans import read_cloud
-from test_cloud_morton import read, seeded_cloud, whole
-from test_cloud_ply import vertices, write as write_ply
+from text_files import lines_of, write_lines
 
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.readers.text import is_number, open_text
@@ -13,18 +14,6 @@ from piccolo.cloud.settings import IN_COLORS
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1)
-
-
-def lines_of(raw, separator=" ", color_format="d"):
-    return [
-        separator.join([*map("{:.6f}".format, point), *(f"{value:{color_format}}" for value in color)])
-        for point, color in zip(raw.points_world, raw.colors, strict=True)
-    ]
-
-
-def write(path, lines, end="\n"):
-    path.write_bytes((end.join(lines) + end).encode())
-    return path
 
 
 def assert_read_as_written(path, raw=RAW):
@@ -36,7 +25,7 @@ def assert_read_as_written(path, raw=RAW):
 @pytest.mark.parametrize("separator", [" ", "\t", "   ", ",", ", ", ";"])
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
 def test_separators_and_line_ends(tmp_path, separator, end):
-    assert_read_as_written(write(tmp_path / "a.txt", lines_of(RAW, separator), end))
+    assert_read_as_written(write_lines(tmp_path / "a.txt", lines_of(RAW, separator), end))
 
 
 @pytest.mark.parametrize(
@@ -51,15 +40,17 @@ def test_separators_and_line_ends(tmp_path, separator, end):
     ],
 )
 def test_headers_are_passed_over(tmp_path, header):
-    assert_read_as_written(write(tmp_path / "a.asc", header + lines_of(RAW)))
+    assert_read_as_written(write_lines(tmp_path / "a.asc", header + lines_of(RAW)))
 
 
 def test_comments_are_passed_over_and_headers_name_columns(tmp_path):
     lines = lines_of(RAW)
-    assert_read_as_written(write(tmp_path / "a.xyz", [*lines[:700], "# half", "", "  ", "//", *lines[700:]]))
+    assert_read_as_written(
+        write_lines(tmp_path / "a.xyz", [*lines[:700], "# half", "", "  ", "//", *lines[700:]])
+    )
     lines = [f"{k},wall,{line}" for k, line in enumerate(lines_of(RAW, ","))]
-    assert_read_as_written(write(tmp_path / "a.csv", ['index,"class",x,y,z,R,G,B', *lines]))
-    assert_read_as_written(write(tmp_path / "a.txt", [line + " 0.5 label" for line in lines_of(RAW)]))
+    assert_read_as_written(write_lines(tmp_path / "a.csv", ['index,"class",x,y,z,R,G,B', *lines]))
+    assert_read_as_written(write_lines(tmp_path / "a.txt", [line + " 0.5 label" for line in lines_of(RAW)]))
     lines = [" ".join([*f[:3], "0.25", *f[3:]]) for f in map(str.split, lines_of(RAW))]
     for header in (
         "//X Y Z Intensity R G B",
@@ -67,14 +58,14 @@ def test_comments_are_passed_over_and_headers_name_columns(tmp_path):
         "x y z i Red Green Blue",
         '"X" "Y" "Z" "I" r g b',
     ):
-        assert_read_as_written(write(tmp_path / "a.asc", [header, "1500", *lines]))
-    assert_read_as_written(write(tmp_path / "a.txt", ["# x y z are metres", *lines_of(RAW)]))
+        assert_read_as_written(write_lines(tmp_path / "a.asc", [header, "1500", *lines]))
+    assert_read_as_written(write_lines(tmp_path / "a.txt", ["# x y z are metres", *lines_of(RAW)]))
 
 
 @pytest.mark.parametrize("header", ["//X Y Z Classification Row Column"])
 def test_columns_without_colors_are_refused(tmp_path, header):
     with pytest.raises(InputError, match=f"the columns are '{header}', wanted lines of numbers x y z r g b"):
-        whole(open_text, write(tmp_path / "a.txt", [header, *lines_of(RAW)]))
+        whole(open_text, write_lines(tmp_path / "a.txt", [header, *lines_of(RAW)]))
 
 
 def test_float_colors_and_nan_points_without_a_color_are_read(tmp_path):
@@ -82,7 +73,7 @@ def test_float_colors_and_nan_points_without_a_color_are_read(tmp_path):
     path.write_text("\n".join(lines_of(RAW, color_format=".2f")))
     assert_read_as_written(path)
     lines = ["nan nan nan nan nan nan", *lines_of(RAW), "inf 0 0 0 0 -1"]
-    cloud = read_cloud(write(tmp_path / "a.txt", lines))
+    cloud = read_cloud(write_lines(tmp_path / "a.txt", lines))
     assert "2 points with NaN" in cloud.warnings[0]
     assert len(cloud.points) == 1500
 
@@ -99,7 +90,7 @@ def test_float_colors_and_nan_points_without_a_color_are_read(tmp_path):
 )
 def test_broken_lines_are_named(tmp_path, broken, message):
     lines = ["# a comment counts", *lines_of(RAW)]
-    path = write(tmp_path / "a.txt", [*lines[:1000], broken, *lines[1000:]])
+    path = write_lines(tmp_path / "a.txt", [*lines[:1000], broken, *lines[1000:]])
     assert_refused(message, read, path)
 
 

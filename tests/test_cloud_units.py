@@ -6,13 +6,13 @@ import sys
 
 import numpy as np
 import pytest
+from clouds import seeded_cloud
 from e57_files import ScanToWrite, write as write_e57
 from las_files import OFFSETS, las_bytes, laz_bytes, with_records
 from pyproj import CRS
 from pyproj.enums import WktVersion
 from refusals import assert_input_error
 from scans import read_cloud
-from test_cloud_morton import seeded_cloud
 
 from piccolo.cloud.settings import BY_FILE, METRES, CloudSettings
 from piccolo.cloud.stream import open_cloud, open_source

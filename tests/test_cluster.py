@@ -14,6 +14,8 @@ from piccolo.cli import localize
 from piccolo.jobs import cluster
 from research.evaluation import evaluate
 
+TIER = "process"
+
 PANOS = [f"images/clean_{k % 3}.jpg" for k in range(12)]
 
 

@@ -40,19 +40,13 @@ from piccolo.judge.result import Result
 from piccolo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map
 
+TIER = "scene"
+
 SEED = 1
 NUM_POINTS = 60_000
 WIDTH = 512
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _coarse():
-    """Photos are aligned by fewer points and pixels, which is enough for a room."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(alignment, "LEAST_ALIGNED_POINTS", 5000)
-        patch.setattr(alignment, "POINTS_PER_PHOTO", 0)
-        patch.setattr(alignment, "ALIGNMENT_WIDTHS", (512, 1024))
-        yield
+pytestmark = pytest.mark.usefixtures("coarse_colors")
 
 
 @functools.lru_cache
@@ -208,7 +202,7 @@ def test_a_photo_sees_the_paint_of_others_alone(tmp_path, monkeypatch):
 
 def test_a_stranger_is_not_localized_by_its_own_paint(tmp_path, monkeypatch):
     monkeypatch.setattr(color_scan, "NUM_COLORING_ROUNDS", 1)
-    scan_map = _gray_map(rooms.room(SEED, 200_000)[1])
+    scan_map = _gray_map(rooms.room(SEED, 80_000)[1])
     settings = rooms.KNOWN
     right = [rooms.query(SEED, index=k, width=WIDTH) for k in range(2)]
     there = step(right[0].pose, np.array([0.0, 0.0, 0.7, 0.9, 0.5, 0.0]))

@@ -25,6 +25,8 @@ from piccolo.cloud.settings import BY_FILE, WITHOUT_COLORS, CloudSettings
 from piccolo.errors import InputError, ResourceError, import_optional
 from piccolo.judge.result import Result
 
+TIER = "scene"
+
 SCRIPTS = [ROOT / "localize.py", *sorted((ROOT / "tools").glob("[a-z]*.py"))]
 
 ONE = ["--cloud", "a.ply", "--pano", "b.jpg"]

@@ -22,6 +22,8 @@ from piccolo.panorama.texels import pack_texels
 from piccolo.problem.method import METHOD
 from research.synthetic.world import mask_outside_field, occlude
 
+TIER = "scene"
+
 WIDTH = rooms.WIDTH
 TILTED = exp_so3(np.array([0.4, -1.1, 0.7]))
 AREAS = solid_angles(WIDTH)[:, None] / (4 * np.pi) * np.ones(WIDTH)

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 from consistency import contradictions_of_line, find_contradictions, lines_of_results
-from test_result import POSE, RESULT
+from results import POSE, RESULT
 
 from piccolo.geometry.pose import Pose
 from piccolo.judge.belief import make_belief

@@ -11,6 +11,8 @@ from piccolo.jobs.threads import Workers
 from piccolo.localization import correlation
 from piccolo.localization.search import turn_panorama
 
+TIER = "scene"
+
 AREA = make_grid(24).solid_angle
 WIDE_AREA = wider_cells(12)[1]
 

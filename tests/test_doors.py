@@ -10,7 +10,7 @@ import pytest
 import rooms
 from hypothesis import given, settings, strategies as st
 from refusals import assert_input_error
-from test_result import RESULT
+from results import RESULT
 
 import piccolo
 from piccolo import Pose, Result
@@ -27,6 +27,8 @@ from piccolo.panorama.texels import pack_texels
 from piccolo.photo import GpsPrior
 from piccolo.result_files import read_results
 from piccolo.views.zbuffer import nearest_depth, render_view, visible_points
+
+TIER = "scene"
 
 I = np.eye(3)  # noqa: E741
 HERE = np.zeros(3)

@@ -16,6 +16,8 @@ from piccolo.jobs.threads import Workers
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.view import Cells
 
+TIER = "scene"
+
 SIZE = np.array([6.0, 5.0, 2.6])  # [m] of a room turned by 20 degrees, so that no wall is along an axis
 TURN = exp_so3(np.array([0.0, 0.0, 0.35]))
 WORKERS = Workers(2)

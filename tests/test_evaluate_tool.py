@@ -20,6 +20,8 @@ from research.evaluation import evaluate
 from research.evaluation.query_result import read_run
 from research.scene import Query, read_scene, write_queries
 
+TIER = "scene"
+
 QUICK = ["--quiet", "--preset", "paper", "max_points=20000", "num_translations=12", "num_iterations=30"]
 
 
@@ -69,6 +71,7 @@ def test_a_run_its_tables_and_files(scenes, tmp_path, capsys):
     assert json.loads(out.read_text().splitlines()[0])["result"]["settings"]["num_translations"] == 12
 
 
+@pytest.mark.process
 def test_a_stopped_run_is_taken_up_and_gives_the_same(scenes, tmp_path, capsys):
     whole, torn = tmp_path / "whole.jsonl", tmp_path / "torn.jsonl"
     assert _run(scenes, whole, "--variants", "clean") == 0

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from pictures import encoded, smooth_rgb, write
-from poses import jpeg, result, tilted_poses
+from poses import jpeg, result, rotation, tilted_poses
 from refusals import assert_input_error, mutated, read_or_refused
-from test_export_tables import rotation
 
 from piccolo.errors import InputError
 from piccolo.export.formats import export

@@ -7,13 +7,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from poses import json_of, lines_of, result, tilted_poses
+from poses import json_of, lines_of, result, rotation, tilted_poses
 from refusals import assert_input_error
 
 from piccolo.errors import InputError
 from piccolo.export.formats import export
 from piccolo.export.posed_images import Options
-from piccolo.geometry.pose import Pose, exp_so3, heading_pitch_roll_deg, rotation_from_quaternion_wxyz
+from piccolo.geometry.pose import Pose, heading_pitch_roll_deg, rotation_from_quaternion_wxyz
 from piccolo.judge.result_parts import Gap, Source, WalkFrame
 
 POSES = tilted_poses(4)
@@ -27,12 +27,6 @@ def evo(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HOME", str(tmp_path_factory.mktemp("home")))
         return import_module("evo.tools.file_interface")
-
-
-def rotation(heading, pitch, roll):
-    """R_world_from_cam of angles in degrees: R_z(90 - heading) R_y(-pitch) R_x(roll)."""
-    z, y, x = np.radians([90.0 - heading, -pitch, roll])
-    return exp_so3(z * EYE[2]) @ exp_so3(y * EYE[1]) @ exp_so3(x * EYE[0])
 
 
 def _results(names=("a", "b", "c", "d"), **changes):

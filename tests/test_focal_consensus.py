@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rooms
+from camera_room import DENSE, SEED, TRUE, place
 from pictures import encoded, write
 from poses import judged
-from test_focal_length import DENSE, TRUE
-from test_localize_cameras import SEED, place
 
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
@@ -25,6 +24,8 @@ from piccolo.judge.result_parts import FocalLength, Source
 from piccolo.result_files import read_results
 from piccolo.together.second_looks import follow_cameras, list_looks_by_focal
 from research.synthetic.world import render_picture
+
+TIER = "scene"
 
 GIVEN = 700.0
 

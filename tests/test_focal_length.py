@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rooms
+from camera_room import DENSE, SEED, TRUE, place, scan
 from pictures import encoded, write
 from poses import judged
-from test_localize_cameras import SEED, place, scan
 
 import piccolo
 from piccolo.camera import Calibration, Camera, Mount
@@ -32,8 +32,7 @@ from piccolo.photo import Photo
 from piccolo.problem.method import METHOD
 from research.synthetic.world import render_picture
 
-TRUE = 160.0  # [px] of the photos here, 320 x 240
-DENSE = 400_000  # points of a room whose photos tell their focal length to a per cent
+TIER = "scene"
 
 
 def _photo(camera, yaw=0.0):

@@ -8,9 +8,8 @@ import numpy as np
 import pycolmap
 import pytest
 import rooms
-from poses import result, tilted_poses, write_results
+from poses import CENTER, result, tilted_poses, write_results
 from refusals import small_files
-from test_export_rerun import DOTS
 
 from piccolo.cli import export_poses
 from piccolo.cloud.stream import open_cloud
@@ -132,8 +131,8 @@ def test_a_library_that_gives_no_reason_is_quoted_in_one_line(tmp_path):
 @TRUNCATED
 def test_recordings(tmp_path, limit):
     (tmp_path / "a.rrd").write_bytes(b"old")
-    shown = [result(tmp_path / "0.jpg", pose) for pose in tilted_poses(1, DOTS[0])]
-    options = Options(size=(512, 256), offset=tuple(DOTS[0]))
+    shown = [result(tmp_path / "0.jpg", pose) for pose in tilted_poses(1)]
+    options = Options(size=(512, 256), offset=tuple(CENTER))
     _assert_refused(
         tmp_path / "a.rrd", lambda: export(shown, "rerun", tmp_path / "a.rrd", options), min(limit, 100)
     )

@@ -4,8 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from poses import tilted_poses
-from test_pose import covariance
+from poses import covariance, tilted_poses
 
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
 from piccolo.geometry.pose_gaussian import add, differentiate_rays, subtract

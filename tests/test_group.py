@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rooms
+from groups import SEED, taken_photos
 
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.jobs.threads import Stopwatch, Workers
@@ -16,8 +17,7 @@ from piccolo.together.group import localize_group
 from piccolo.together.links import FIRM, WEAK, Links, Placed, compute_shared, find_links, list_pairs, spread
 from piccolo.together.members import Shot
 
-SEED = 5
-TURN = (6.75, 7.0, 7.25)  # eighths, of photos of 75 degrees that overlap: none is sure alone
+TIER = "scene"
 
 
 def _sphere(num, seed):
@@ -76,13 +76,6 @@ def test_what_photos_show_in_common_is_told_by_their_keypoints(turned_deg, least
     assert least <= compute_shared(links, places, 0) <= most
     nothing = {**places, 0: places[0]._replace(ranges=np.zeros(len(rays), np.float32))}
     assert compute_shared(links, nothing, 0) == 0.0, "a bare wall is not known to be shown twice"
-
-
-@functools.lru_cache
-def taken_photos():
-    """Photos with their true poses."""
-    offsets = {k: np.random.default_rng(int(10 * k)).uniform(-0.2, 0.2, 3) for k in TURN}
-    return rooms.take_photos(SEED, 75.0, offsets, 1024)
 
 
 @functools.lru_cache

@@ -6,19 +6,22 @@ import math
 import numpy as np
 import pytest
 import rooms
+from groups import SEED, taken_photos
 from pictures import encoded, write
 from services import serving
-from test_group import SEED, taken_photos
 
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli.localize import main
 from piccolo.opening import open_scan
-from piccolo.photo import Photo
+from piccolo.photo import Photo, Prior
 from piccolo.result_files import read_results
 from research.synthetic.world import render_picture
 
+TIER = "scene"
+
 SIZE = (320, 240)
+NEAR = (*(round(x, 1) for x in taken_photos()[0][1].center_world.tolist()), 1.0)  # [m] place and radius
 FOCAL = 0.5 * SIZE[0] / math.tan(math.radians(37.5))
 
 
@@ -51,11 +54,14 @@ def _command(folder, *options):
         FOCAL,
         "--gravity",
         "known",
+        "--near",
+        *NEAR,
         *options,
     ]
     return list(map(str, words))
 
 
+@pytest.mark.process
 def test_photos_of_a_folder_are_localized_together_and_named(folder, tmp_path, capsys):
     out = tmp_path / "poses.jsonl"
     trace = tmp_path / "trace.jsonl"
@@ -79,9 +85,13 @@ def test_photos_of_a_folder_are_localized_together_and_named(folder, tmp_path, c
     lines = [untimed_line(result.to_json()) for result in by_name.values()]
     photos = [Photo(result.pano, focal_px=FOCAL) for result in by_name.values()]
     scan = open_scan(rooms.map_path(SEED))
-    assert [untimed_line(r.to_json()) for r in scan.localize_together(photos, gravity="known")] == lines
+    assert [
+        untimed_line(r.to_json())
+        for r in scan.localize_together(photos, gravity="known", prior=Prior(near=NEAR[:3], radius=NEAR[3]))
+    ] == lines
     pictures = {name: (folder / name).read_bytes() for name in by_name}
-    asked = {"photo": {"focal_px": FOCAL}, "gravity": "known", "together": True}
+    near = {"near": NEAR[:3], "radius": NEAR[3]}
+    asked = {"photo": {"focal_px": FOCAL}, "prior": near, "gravity": "known", "together": True}
     with serving("--cloud", rooms.map_path(SEED), "--jobs", "1") as client:
         status, _, body = client.post_all("/localize", pictures, asked)
         assert client.post_all("/localize", pictures, asked | {"together": "yes"})[0] == 400

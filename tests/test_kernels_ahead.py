@@ -13,6 +13,8 @@ from piccolo.files.atomic import hold_lock, write_atomically
 from piccolo.kernels import ahead
 from piccolo.kernels.jit import kernel
 
+TIER = "process"
+
 ROOT = Path(__file__).parents[1]
 FLAT = ROOT / "examples" / "flat"
 # runs a command and prints, a line each, the kernels that it asked for by themselves

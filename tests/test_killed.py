@@ -14,6 +14,8 @@ from piccolo.cli.localize import main
 from piccolo.export.formats import export
 from piccolo.export.posed_images import Options
 
+TIER = "process"
+
 SEED = 1
 WIDTH = 256
 PATIENCE = 120.0  # [s]

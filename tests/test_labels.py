@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 import pytest
 import rooms
+from clouds import seeded_cloud, whole
 from las_files import OFFSETS, las_bytes, laz_bytes
+from pcd_files import content_of
 from pictures import write
 from plyfile import PlyData, PlyElement
 from refusals import assert_input_error, assert_refused
 from rooms import errors, write_room
 from scans import write_scalars
 from scipy.spatial.distance import pdist
-from test_cloud_morton import seeded_cloud, whole
-from test_cloud_pcd import content_of
 
 from piccolo.cli import localize, prepare_map
 from piccolo.cloud.readers.reader import RawCloud
@@ -29,6 +29,8 @@ from research.evaluation import evaluate
 from research.evaluation.query_result import read_run
 from research.scene import read_scene
 from research.synthetic.layout import LABEL_NAMES
+
+TIER = "scene"
 
 POINTS = seeded_cloud(1, num_points=3000).points_world
 LABELS = np.random.default_rng(2).integers(0, 21, 3000)

@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import re
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -176,3 +177,9 @@ def test_a_number_has_a_name_of_its_own():
             users.setdefault(name, set()).add(module)
     assert len(users) > 500
     assert {name: found for name, found in users.items() if len(found) > 1} == {}
+
+
+def test_no_test_imports_another():
+    """What tests share is in a module beside them."""
+    for path in sorted([*(ROOT / "tests").glob("*.py"), *(ROOT / "browser_tests").glob("*.py")]):
+        assert not re.findall(r"^\s*(?:from|import) test_\w+", path.read_text(), flags=re.MULTILINE), path

@@ -19,6 +19,8 @@ from piccolo.localization.attempts import join_features, match_poses
 from piccolo.photo import Prior
 from piccolo.problem.settings import CoarseToFineSettings
 
+TIER = "scene"
+
 
 @functools.lru_cache
 def _problem(seed, variant="clean"):

@@ -24,6 +24,8 @@ from piccolo.local_features.matching import (
 )
 from piccolo.localization.attempts import join_features
 
+TIER = "scene"
+
 
 def _descriptors(rng, count):
     return rng.integers(-127, 128, (count, feature_map.NUM_COMPONENTS)).astype(np.int8)

@@ -16,6 +16,8 @@ from piccolo.local_features.perspective_view import MULTIPLE, add_margin, cover_
 from piccolo.local_features.view_image import fill_gaps, render_gray
 from research.synthetic.raycast import cast_rays
 
+TIER = "scene"
+
 SPHERE = 512
 FOCAL = 120.0
 RAYS = pixel_rays(SPHERE)

@@ -19,6 +19,8 @@ from piccolo.scan_map import camera_positions
 from piccolo.scan_map.camera_positions import find_supported_cells, heights_above_floor, top_surfaces
 from piccolo.scan_map.scan_map import prepare_map
 
+TIER = "scene"
+
 
 def _localize(seed, rgb, settings, num_threads=2):
     return rooms.locate(as_panorama(rgb), scan_map(seed), settings, num_threads)

@@ -29,6 +29,8 @@ from piccolo.views.view import Cells
 from research.synthetic.places import make_alike
 from research.synthetic.world import World, make_query, scan_world
 
+TIER = "scene"
+
 
 class Photo(NamedTuple):
     """A photo whose images must not be asked for."""

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import rooms
 from batches import command_of, start_localize
+from results import RESULT
 from rooms import errors, query
-from test_result import RESULT
 
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
@@ -26,6 +26,8 @@ from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result
 from piccolo.judge.result_parts import FocalLength
 from research.scene import read_scene
+
+TIER = "scene"
 
 PAPER = ["--preset", "paper", "num_translations=30", "num_iterations=60", "max_points=30000"]
 
@@ -184,6 +186,7 @@ def test_usage_and_version(capsys):
     assert len(re.findall("^  -", text, flags=re.MULTILINE)) <= 49
 
 
+@pytest.mark.process
 def test_a_signal_leaves_nothing_half_written(scene, tmp_path):
     arguments = _arguments(scene, "--out", str(tmp_path / "pose.json"), *PAPER, "num_translations=5000")
     terminal, stderr = pty.openpty()
@@ -202,6 +205,7 @@ def test_a_signal_leaves_nothing_half_written(scene, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.process
 def test_closed_pipe_is_no_error_message(scene):
     with start_localize(_arguments(scene, "--quiet"), stdout=subprocess.PIPE) as process:
         process.stdout.close()
@@ -209,6 +213,7 @@ def test_closed_pipe_is_no_error_message(scene):
     assert process.returncode == 141
 
 
+@pytest.mark.process
 def test_first_use_is_announced_and_two_processes_may_share_it(scene, tmp_path):
     """The first one waits, where it begins to compile, until the second has come as far."""
     options = {"env": {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}, "stdout": subprocess.PIPE}

@@ -1,6 +1,5 @@
 """Photos of other cameras than spheres, from the file to the pose."""
 
-import functools
 import json
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import rooms
+from camera_room import SEED, place, scan
 from cameras import four_sides
 from pictures import encoded, write
 from PIL import Image
@@ -23,24 +23,13 @@ from piccolo.judge.result import Result
 from piccolo.panorama import read_panorama
 from piccolo.photo import Photo
 from piccolo.result_files import read_results
-from research.synthetic.world import make_query, photograph, picture_of_all, pose_of_query, render_picture
+from research.synthetic.world import photograph, picture_of_all, render_picture
+
+TIER = "scene"
 
 BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 FISHEYE = Camera("OPENCV_FISHEYE", 256, 256, (75.0, 75.0, 128.0, 128.0, 0.01, -0.003, 0.0, 0.0), 95.0)
 DUAL = (Mount(FISHEYE), Mount(FISHEYE, BACK, offset=(256, 0)))
-SEED = 5
-
-
-def scan():
-    return rooms.scan(SEED)
-
-
-@functools.lru_cache
-def place(index=2):
-    """The room as a query finds it, and the query's pose in the world; some cost the search much time."""
-    world = rooms.room(SEED)[0]
-    this, _, _ = pose_of_query(world, index, "clean")
-    return this, make_query(world, index, "clean", 128, Workers(2)).pose
 
 
 def cut(full, mount):

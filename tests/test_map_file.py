@@ -21,6 +21,8 @@ from piccolo.scan_map import map_file, open_map
 from piccolo.scan_map.map_file import first_misplaced, is_map_file, load_map, save_map
 from piccolo.scan_map.open_map import content_key
 
+TIER = "scene"
+
 
 @pytest.fixture
 def built():

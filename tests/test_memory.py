@@ -28,6 +28,8 @@ from piccolo.panorama.video import frames_of
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.candidate_views import SEARCH_VIEW, render_views, render_wide
 
+TIER = "scene"
+
 
 @pytest.fixture
 def address_space():

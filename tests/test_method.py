@@ -16,6 +16,8 @@ from piccolo.judge.selection import is_clear, is_sure
 from piccolo.problem.method import METHOD, Method
 from piccolo.problem.settings import CoarseToFineSettings
 
+TIER = "scene"
+
 PICCOLO = Path(__file__).resolve().parents[1] / "piccolo"
 NAMES = [field.name for field in fields(Method)]
 

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rooms
+from camera_room import TRUE, place, scan
 from made_up import PROBLEM, make_candidate, make_selection
-from test_focal_length import TRUE
-from test_localize_cameras import place, scan
-from test_walk import _walk_through
+from walks import walk_through
 
 import piccolo
 from piccolo.camera import Mount
@@ -22,6 +21,8 @@ from piccolo.judge.probability import Standing
 from piccolo.judge.reasons import Reason
 from piccolo.localization import judging
 from research.synthetic.world import photograph, render_picture
+
+TIER = "scene"
 
 HERE = Pose(np.eye(3), np.zeros(3))
 
@@ -73,7 +74,7 @@ def test_photos_of_one_wrong_focal_length_are_not_sure_together():
 
 def test_a_frame_that_contradicts_the_prior_says_so_in_a_walk():
     world = rooms.room(3)[0]
-    poses = _walk_through(world)[:4]
+    poses = walk_through(world)[:4]
     frames = [photograph(world.rooms[0], p, rooms.WIDTH, Workers(2)) for p in poses]
     prior = piccolo.Prior(near=tuple(poses[0].center_world), radius=0.4)
     times = [0.5 * k for k in range(len(frames))]

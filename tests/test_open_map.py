@@ -23,6 +23,8 @@ from piccolo.scan_map import map_file, open_map, scan_map as making
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.open_map import CachePolicy
 
+TIER = "scene"
+
 
 @pytest.fixture(scope="module")
 def cloud(tmp_path_factory):

@@ -8,6 +8,8 @@ import sys
 from batches import ROOT, run, work
 from rooms import write_room
 
+TIER = "process"
+
 SYSTEMS_OWN = {"fcntl", "resource", "pwd", "grp", "termios", "msvcrt", "winreg"}
 VARYING = rb'"seconds": ?{[^}]*}|[0-9a-f]{32}'
 # Modules and functions of Linux are taken away, when the libraries that know each system have been imported.

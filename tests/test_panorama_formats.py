@@ -57,6 +57,7 @@ def test_grey_tiff_becomes_rgb(tmp_path, dtype, photometric):
     np.testing.assert_array_equal(rgb, np.repeat((expected >> (8 * grey.itemsize - 8))[..., None], 3, axis=2))
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("compression", [1, 5, 8, 32946, 32773])
 @pytest.mark.parametrize("image", [RGB, np.dstack([RGB, RGB[..., :1]]), RANDOM16[..., :3]])
 def test_packed_tiff_comes_back_exactly(tmp_path, compression, image):
@@ -79,6 +80,7 @@ BAD_WEBP = "the WEBP is cut off, damaged or of an unsupported kind"
 WEBP = with_metadata(encoded(RGB, ".webp", LOSSLESS), orientation=1)
 
 
+@pytest.mark.process
 def test_further_pages_are_left_with_a_warning(tmp_path):
     panorama = read_panorama(write(tmp_path / "a.tif", tiff(RGB, next_begin=8)))
     np.testing.assert_array_equal(panorama.rgb, RGB)
@@ -89,6 +91,7 @@ def test_further_pages_are_left_with_a_warning(tmp_path):
     assert len(panorama.warnings) == 1
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -116,6 +119,7 @@ def test_other_files_are_refused_by_name(tmp_path, content, message, capfd):
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("compression", [5, 8, 32773])
 def test_tiff_with_damaged_strips_is_refused(tmp_path, compression, capfd):
     noise = np.random.default_rng(1).integers(0, 256, (64, 128, 3), dtype=np.uint8)
@@ -143,6 +147,7 @@ def test_cmyk_jpeg_becomes_rgb(tmp_path):
     assert np.abs(rgb - expected)[:, np.r_[:56, 72:128]].max() <= 4
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("kind", ["PNG", "TIFF"])
 def test_palettes_become_rgb(tmp_path, kind):
     image = Image.frombytes("P", (128, 64), (RGB[..., 0] // 8).tobytes())
@@ -155,6 +160,7 @@ def test_palettes_become_rgb(tmp_path, kind):
     np.testing.assert_array_equal(panorama.is_valid, (RGB[..., 0] // 8 != 3) | (kind == "TIFF"))
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])  # the largest panorama in a WebP is below it
 @pytest.mark.parametrize("compression", [1, 5])
 def test_the_limit_of_pillow_is_not_ours(tmp_path, monkeypatch, suffix, compression):
@@ -238,6 +244,7 @@ FILES = {
 }
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("content", FILES.values(), ids=FILES)
 def test_the_files_are_read_as_they_are(tmp_path, content):
     assert read_panorama(write(tmp_path / "a", content)).rgb.shape[2] == 3
@@ -251,6 +258,7 @@ def check(path):
         assert panorama.rgb.shape[1] == 2 * panorama.rgb.shape[0]
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("content", FILES.values(), ids=FILES)
 @settings(deadline=None, max_examples=40)
 @given(data=st.data())
@@ -260,6 +268,7 @@ def test_mutated_files_are_read_or_refused(content, data, tmp_path_factory):
     check(write(path, content[:begin] + mutated(data.draw, st.integers, content[begin:])))
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("name", ["tiff", "tiff, 16 bits, big end", "tiff, packed by 5", "tiff, packed by 8"])
 @settings(deadline=None, max_examples=30)
 @given(data=st.data())

@@ -27,6 +27,8 @@ from piccolo.paper.localize import (
 from piccolo.scan_map.camera_positions import MIN_CLEARANCE
 from piccolo.views.zbuffer import is_free_space
 
+TIER = "scene"
+
 QUICK = dataclasses.replace(PaperSettings(), num_translations=30, max_points=30_000, num_iterations=60)
 
 

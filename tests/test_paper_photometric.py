@@ -26,6 +26,8 @@ from research.experiments.photometric import (
     view_gradient,
 )
 
+TIER = "scene"
+
 HALF_SIZE = np.array([2.5, 2.0, 1.3])
 WIDTH = 128
 TURNED = Pose(exp_so3(np.array([0.3, -0.5, 2.0])), np.array([0.4, -0.3, 0.2]))

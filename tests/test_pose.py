@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from poses import tilted_poses
+from poses import covariance, tilted_poses
 from refusals import assert_input_error
 
 from piccolo.geometry import pose as poses
@@ -152,12 +152,6 @@ def test_poses_are_a_group_and_act_on_points():
 
 NEAR = np.array([2.0, -1.0, 0.5])
 NONE = np.zeros((6, 6))
-
-
-def covariance(rng, std=0.01):
-    """A covariance (6, 6) without symmetries."""
-    A = std * rng.normal(size=(6, 6))
-    return A @ A.T + std**2 * np.eye(6)
 
 
 def test_steps_are_added_and_subtracted():

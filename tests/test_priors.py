@@ -8,12 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rooms
-from las_files import las_bytes, with_records
-from PIL import Image
-from PIL.ExifTags import GPS, IFD, Base
+from las_files import RAW, las_bytes, with_records
+from pictures import write_photo
 from pyproj import Transformer
 from refusals import assert_input_error, assert_refused
-from test_cloud_las import RAW
 
 import piccolo
 from piccolo.batch.inputs import read_priors
@@ -21,6 +19,8 @@ from piccolo.cloud.settings import CloudSettings, from_wgs84
 from piccolo.cloud.stream import read_crs
 from piccolo.panorama.photo import GpsPosition, PhotoFacts, read_photo_facts
 from piccolo.photo import Photo, Prior
+
+TIER = "scene"
 
 
 @pytest.mark.parametrize(
@@ -81,25 +81,6 @@ def test_empty_cells_fall_back_and_paths_go_before_names(tmp_path):
 
 UTM = "EPSG:25832"
 OFFSET = np.array([500_000.0, 5_400_000.0, 300.0])  # of a room in UTM
-
-
-def write_photo(path, rgb, position=None, accuracy=None, time=None):
-    """A JPEG with GPS (latitude, longitude) [deg] and a time of EXIF."""
-    exif = Image.Exif()
-    if position is not None:
-        gps = exif.get_ifd(IFD.GPSInfo)
-        tags = (GPS.GPSLatitude, GPS.GPSLatitudeRef, "NS"), (GPS.GPSLongitude, GPS.GPSLongitudeRef, "EW")
-        for value, (number, reference, letters) in zip(position, tags, strict=True):
-            degrees, rest = divmod(abs(value), 1.0)
-            minutes, rest = divmod(rest * 60.0, 1.0)
-            gps[number], gps[reference] = (degrees, minutes, rest * 60.0), letters[value < 0]
-        if accuracy is not None:
-            gps[GPS.GPSHPositioningError] = accuracy
-    if time is not None:
-        own = exif.get_ifd(IFD.Exif)
-        own[Base.DateTimeOriginal], own[Base.SubsecTimeOriginal], own[Base.OffsetTimeOriginal] = time
-    Image.fromarray(rgb).save(path, quality=95, exif=exif)
-    return path
 
 
 def test_a_photo_says_what_it_is_and_when_and_where_it_was_taken(tmp_path):

@@ -14,6 +14,8 @@ from batches import ROOT
 from piccolo.errors import InputError
 from piccolo.jobs.processes import IN_FLIGHT, Here, Processes, WorkerLostError
 
+TIER = "process"
+
 
 def _die():
     os.kill(os.getpid(), signal.SIGKILL)

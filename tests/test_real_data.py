@@ -9,6 +9,8 @@ import piccolo
 from piccolo.geometry.pose import pose_errors
 from research.scene import read_scene
 
+TIER = "process"
+
 CORRIDOR = read_scene(Path(__file__).parent / "data" / "corridor")
 
 

@@ -29,6 +29,8 @@ from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.result_files import read_results
 
+TIER = "scene"
+
 RECIPES = sorted((ROOT / "docs" / "recipes").glob("*.md"))
 SEED = 3
 NAMES = [f"photos/clean_{k}.jpg" for k in range(4)] + ["more/clean_4.jpg"]

@@ -26,6 +26,8 @@ from piccolo.problem.stages import AROUND_FINE, AROUND_MIDDLE, FULL, LAST, NEARL
 from piccolo.views.points_around import round_position
 from piccolo.views.view import Cells
 
+TIER = "scene"
+
 FINE_BLOCKS = VIEWS["fine"].arrays.blocks
 ALL = np.ones(len(FINE_BLOCKS), bool)
 ALONE = Workers(1)

@@ -14,6 +14,8 @@ from piccolo.geometry.pose import heading_pitch_roll_deg
 from research.datasets import true_poses
 from research.scene import read_scene
 
+TIER = "scene"
+
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):

@@ -16,6 +16,8 @@ from piccolo.errors import InputError
 from piccolo.report.pictures import PIXEL, plan_matrix, read_control_points
 from piccolo.report.plan_file import COLORS, DPI, color_of, segments_of
 
+TIER = "scene"
+
 SVG = "{http://www.w3.org/2000/svg}"
 
 

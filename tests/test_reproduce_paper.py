@@ -23,6 +23,8 @@ from research.experiments import reproduce_paper
 from research.experiments.reproduce_paper import EXPERIMENTS, conditions_of, flip, thin, with_random_rotation
 from research.scene import Query, read_scene, write_queries
 
+TIER = "scene"
+
 PRESETS = [PaperSettings(), CoarseToFineSettings()]
 QUICK = PaperSettings(num_translations=8, num_iterations=20)
 

@@ -18,6 +18,8 @@ from piccolo.paper.localize import PaperSettings
 from piccolo.photo import Prior
 from piccolo.problem.settings import CoarseToFineSettings
 
+TIER = "scene"
+
 
 @pytest.fixture(scope="module")
 def scan():

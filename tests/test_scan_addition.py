@@ -27,6 +27,8 @@ from piccolo.scan_map.scan_addition import add_scan
 from piccolo.scan_map.scan_map import find_scan_at, name_scan, prepare_map
 from piccolo.views.candidate_views import SEARCH_VIEW, WideViews, render_wide
 
+TIER = "scene"
+
 BESIDE = np.array([5.3, 0.4, 0.2])  # of a second room, from where it was made [m]
 WORKERS = Workers(2)
 

@@ -23,6 +23,8 @@ from piccolo.problem.profile import ImageScales
 from piccolo.problem.settings import Effort
 from research.synthetic.world import mask_outside_field
 
+TIER = "scene"
+
 AREA = make_grid(24).solid_angle
 EFFORT = Effort(num_yaws=12, num_rotations=2000, max_starts=4000)
 

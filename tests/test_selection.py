@@ -24,6 +24,8 @@ from piccolo.localization.ladder import FINE, refine
 from piccolo.localization.last_descent import refine_best
 from piccolo.panorama.texels import pack_texels
 
+TIER = "scene"
+
 ALONE = Workers(1)
 
 

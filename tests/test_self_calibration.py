@@ -24,6 +24,8 @@ from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.optimize.self_calibration import sum_free_equations
 from piccolo.panorama.texels import pack_texels
 
+TIER = "scene"
+
 SEED = 5
 LENSES = {
     "sphere": Mount(whole_sphere(512, 256)),

@@ -24,6 +24,8 @@ from piccolo.photo import Photo, Prior
 from piccolo.service.asking import clean_name
 from piccolo.service.description import describe_service
 
+TIER = "process"
+
 NEEDED = ("status", "confidence", "center_world", "R_cam_from_world", "covariance", "alternatives")
 
 
@@ -358,10 +360,10 @@ def test_a_scan_that_is_replaced_is_opened_again(folder, scene, photo):
         assert json.loads(client.ask("GET", "/scan")[2])["scanSha256"] == before["cloud_sha256"]
         rooms.write_cloud(path, 3)
         deadline = time.monotonic() + 60.0
-        with ThreadPoolExecutor(4) as pool:
+        with ThreadPoolExecutor(2) as pool:
             while json.loads(client.ask("GET", "/scan")[2])["scanSha256"] == before["cloud_sha256"]:
                 assert time.monotonic() < deadline
-                shown = list(pool.map(lambda k: client.post("/show", f"{k}.jpg", photo), range(4)))
+                shown = list(pool.map(lambda k: client.post("/show", f"{k}.jpg", photo), range(2)))
                 assert all(body.count(b"\n") == 2 and b'"pictures"' in body for _, _, body in shown)
         after = json.loads(client.post("/localize", "a.jpg", photo)[2])
     assert (before["status"], after["status"]) == ("localized", "not_localized")

@@ -10,6 +10,8 @@ from services import serving
 
 from piccolo.cli.serve import check_url
 
+TIER = "process"
+
 PUBLIC = "https://scans.example/flat/"
 SHOP = "https://shop.example"
 

@@ -14,6 +14,8 @@ from services import serving
 
 from piccolo.service import connections
 
+TIER = "process"
+
 FORM = b"POST /localize HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=x\r\n"
 PART = b'--x\r\nContent-Disposition: form-data; name="picture"; filename="a.jpg"\r\n\r\n'
 STALL_S = 0.5

@@ -2,6 +2,7 @@
 
 import json
 import resource
+import time
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from batches import workers_of
 from services import serving
 
 from piccolo.service.connections import LINES
+
+TIER = "process"
 
 NO_FILE = resource.RLIMIT_NOFILE
 FULL = resource.RLIMIT_FSIZE  # no file grows beyond it, as on a full disk
@@ -44,8 +47,11 @@ def _limited(pid, what, limit):
 
 
 def _next_file(pid):
-    """The number that the next file gets."""
-    used = {int(path.name) for path in Path(f"/proc/{pid}/fd").iterdir()}
+    """The number that the next file gets, as soon as those of the request before are closed."""
+    used = None
+    while (now := {int(path.name) for path in Path(f"/proc/{pid}/fd").iterdir()}) != used:
+        used = now
+        time.sleep(0.5)
     return min(set(range(len(used) + 1)) - used)
 
 

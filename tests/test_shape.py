@@ -40,6 +40,8 @@ from piccolo.scan_map.scan_map import SHAPE_ALONE, prepare_map
 from research.synthetic.places import make_alike
 from research.synthetic.world import World, make_query, scan_world
 
+TIER = "scene"
+
 WIDTH = 1024
 SEED = 6  # of a room whose walls are plain: strong patterns hide its edges
 NUM_POINTS = 200_000

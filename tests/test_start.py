@@ -18,6 +18,8 @@ from piccolo.cli import localize, start
 from piccolo.cli.start import COMMANDS
 from piccolo.scan_map.map_file import save_map
 
+TIER = "scene"
+
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
@@ -55,6 +57,7 @@ libc.fclose(file)
 """
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("told", "least", "most"),
     [({}, 2, 2), ({"MALLOC_ARENA_MAX": "8"}, 3, 8), ({"GLIBC_TUNABLES": "glibc.malloc.arena_max=6"}, 3, 6)],
@@ -67,6 +70,7 @@ def test_threads_share_two_arenas_unless_the_environment_says_more(tmp_path, tol
     assert least <= (tmp_path / "info.xml").read_text().count("<heap nr") <= most
 
 
+@pytest.mark.process
 def test_console_commands_begin_before_their_libraries():
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     assert scripts == {f"piccolo-{n.replace('_', '-')}": f"piccolo.cli.start:{n}" for n in COMMANDS}
@@ -76,6 +80,7 @@ def test_console_commands_begin_before_their_libraries():
         _ = start.loclize
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("script", "number", "code", "word"),
     [
@@ -93,6 +98,7 @@ def test_signals_while_libraries_are_imported(script, number, code, word, tmp_pa
     assert process.returncode == code
 
 
+@pytest.mark.process
 def test_a_library_that_cannot_be_loaded_is_one_line(tmp_path):
     (tmp_path / "numpy.py").write_text("raise MemoryError\n")
     done = run(command_of("localize.py"), env={"PYTHONPATH": str(tmp_path)})
@@ -100,6 +106,7 @@ def test_a_library_that_cannot_be_loaded_is_one_line(tmp_path):
     assert done.stderr == "localize.py: the libraries cannot be loaded (not enough memory)\n"
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("redirection", [">&-", ">/dev/full"])
 def test_a_result_that_cannot_be_written_is_an_error(scene, tmp_path, redirection):
     code, out, err = _shell(("", redirection), *_prepare(scene, tmp_path / "a.map", "--quiet"))
@@ -108,6 +115,7 @@ def test_a_result_that_cannot_be_written_is_an_error(scene, tmp_path, redirectio
     assert err.count("\n") == 1
 
 
+@pytest.mark.process
 def test_stderr_closed_and_names_that_the_locale_does_not_know(scene, tmp_path):
     shell = "env LC_ALL=C PYTHONUTF8=0 PYTHONCOERCECLOCALE=0 "
     code, out, err = _shell((shell, "2>&- <&-"), *_prepare(scene, tmp_path / "ж.map"))
@@ -119,6 +127,7 @@ def test_stderr_closed_and_names_that_the_locale_does_not_know(scene, tmp_path):
     assert err.startswith("localize.py: ")
 
 
+@pytest.mark.process
 def test_little_address_space_is_refused_before_libraries_are_loaded(scene, tmp_path):
     code, _, err = _shell(("ulimit -v 488281; exec ", ""), *_prepare(scene, tmp_path / "a.map"))
     assert code == 3
@@ -126,6 +135,7 @@ def test_little_address_space_is_refused_before_libraries_are_loaded(scene, tmp_
     assert err.count("\n") == 1
 
 
+@pytest.mark.process
 def test_address_space_that_runs_out_is_one_line(scene, tmp_path):
     code = """
 import resource, sys
@@ -158,6 +168,7 @@ def test_scans_of_nearly_nothing_are_no_error(tmp_path, scene, capsys, name):
         assert result["warnings"][-1].startswith("the scan: found no place for a camera")
 
 
+@pytest.mark.process
 def test_a_photo_in_a_prepared_map_does_not_wait_for_scipy(tmp_path):
     """It takes longer to import than the photo."""
     prepared, image = tmp_path / "a.map", tmp_path / "a.png"

@@ -13,6 +13,8 @@ from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scan_map.storeys import Storey, find_storeys
 from research.synthetic.world import make_world, scan_world
 
+TIER = "scene"
+
 
 def _octree(*parts):
     voxels = rooms.voxels(np.concatenate(parts))

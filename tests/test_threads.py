@@ -16,6 +16,8 @@ from piccolo.jobs.threads import Once, Workers, one_blas_thread
 from piccolo.localization import localize as method
 from piccolo.problem.settings import CoarseToFineSettings
 
+TIER = "scene"
+
 
 @pytest.mark.parametrize("num_threads", [1, 3])
 def test_results_come_in_order_and_an_error_ends_the_display_before_it_is_raised(num_threads):
@@ -79,6 +81,7 @@ def test_one_callers_work_may_wait_for_anothers():
     caller.join()
 
 
+@pytest.mark.process
 def test_a_forked_process_has_threads_of_its_own():
     workers = Workers(2)
     list(workers.map(abs, range(4), "before"))

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rooms
+from camera_room import DENSE, SEED, TRUE, place
 from pictures import encoded, write
 from poses import result
 from services import serving
-from test_focal_length import DENSE, TRUE
-from test_localize_cameras import SEED, place
 
 import piccolo
 from piccolo.batch.relative_poses import read_relative_poses
@@ -22,6 +21,8 @@ from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from research.synthetic.world import render_picture
+
+TIER = "scene"
 
 FOCAL = 1.03 * TRUE  # as it is told, 3 % too long
 NUM_PHOTOS = 4
@@ -50,6 +51,7 @@ def photos(tmp_path_factory):
     return sorted(folder.iterdir())
 
 
+@pytest.mark.process
 def test_photos_of_one_camera(photos, tmp_path):
     """Three say together what their focal length is; the fourth is looked at again beside them."""
     cloud = str(rooms.map_path(SEED, DENSE))
@@ -82,7 +84,7 @@ def test_photos_of_one_camera(photos, tmp_path):
         assert answer | {"pano": line["pano"], "beside": beside} == line
 
 
-def test_a_bundle_a_walk_and_a_colouring(tmp_path):
+def test_a_bundle_a_walk_and_a_colouring(tmp_path, coarse_colors):
     cloud = rooms.write_cloud(tmp_path / "scan.ply", 1, 60_000)
     queries = [rooms.query(1, index=k, width=512) for k in range(2)]
     paths = [str(tmp_path / COLOR.format(k)) for k in range(2)]

@@ -5,6 +5,7 @@ import math
 from dataclasses import replace
 
 import cv2
+import narrow_photo
 import numpy as np
 import pytest
 import rooms
@@ -33,118 +34,91 @@ from piccolo.photo import Prior
 from piccolo.problem.method import METHOD
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.zbuffer import visible_points
-from research.synthetic.world import change_light, mask_outside_field, photograph, scan_world
+from research.synthetic.world import scan_world
 
-NUM_POINTS = 200_000
-WIDTH = 1024
+TIER = "scene"
+
 APART = np.float32([6.0, 0.0, 0.0])  # [m] of a room and its twin
 SMALL = np.array([0.01, -0.02, 0.015, 0.05, -0.04, 0.03])  # [rad], [m]
 
 
-def _narrow(seed=1, yaw=1.0):
-    """A level photo of 70 degrees that looks along an azimuth, and its true pose in the world."""
-    taken = rooms.query(seed, width=WIDTH)
-    return Panorama(taken.rgb, ~mask_outside_field(WIDTH, 70.0, yaw)), taken.pose
-
-
-@functools.lru_cache
-def _problem():
-    return rooms.ask(_narrow()[0], rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
-
-
 def _draw(pose, workers=WORKERS):
     """The matches with the scan drawn near a pose."""
-    return verification.draw_near(_problem(), pose, None, workers).matches
+    return verification.draw_near(narrow_photo.problem(), pose, None, workers).matches
 
 
 def _verify(pose, workers=WORKERS):
-    return verification.verify(_problem(), pose, _draw(pose, workers))
+    return verification.verify(narrow_photo.problem(), pose, _draw(pose, workers))
 
 
 def _count(problem, pose):
     return count_agreeing(problem, examine(problem, pose), WORKERS).num_matches
 
 
-@functools.lru_cache
-def _true_pose():
-    return rooms.local(1, _narrow()[1], NUM_POINTS)
-
-
 def _moved(offset, yaw=0.0):
     """The true pose, turned and moved [m]."""
-    R = yaw_rotation(yaw) @ _true_pose().R_cam_from_world
-    return Pose(R, _true_pose().center_world + np.array(offset))
-
-
-@functools.lru_cache
-def _beside():
-    """The keypoints of a photo taken half a metre beside, with other noise and light, at its true pose."""
-    world = rooms.room(1, NUM_POINTS)[0]
-    here = _narrow()[1]
-    pose = Pose(yaw_rotation(0.1) @ here.R_cam_from_world, here.center_world + np.array([0.3, 0.4, 0.0]))
-    rng = np.random.default_rng(0)
-    rgb = change_light(photograph(world.rooms[0], pose, WIDTH, Workers(2)), rng, rng)
-    panorama = Panorama(rgb, _narrow()[0].is_valid)
-    problem = rooms.ask(panorama, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
-    return verification.place_keypoints(problem, rooms.local(1, pose, NUM_POINTS), WORKERS)
+    R = yaw_rotation(yaw) @ narrow_photo.true_pose().R_cam_from_world
+    return Pose(R, narrow_photo.true_pose().center_world + np.array(offset))
 
 
 def test_a_photo_is_matched_with_one_beside_it_on_the_scan():
-    matches = verification.match_beside(_problem(), _beside(), WORKERS)
-    agreeing = count_matches(matches, _true_pose(), METHOD.cos_agree)
+    matches = verification.match_beside(narrow_photo.problem(), narrow_photo.beside(), WORKERS)
+    agreeing = count_matches(matches, narrow_photo.true_pose(), METHOD.cos_agree)
     assert agreeing >= 20
     assert (np.diff(matches.query) >= 0).all()
     assert count_matches(matches, _moved((0.5, -0.4, 0.0)), METHOD.cos_agree) < 0.3 * agreeing
-    cloud = np.asarray(rooms.room(1, NUM_POINTS)[1].points)
+    cloud = np.asarray(rooms.room(1, narrow_photo.NUM_POINTS)[1].points)
     nearest = [np.linalg.norm(cloud - point, axis=1).min() for point in matches.points]
     assert np.median(nearest) < 0.05
 
 
 def test_what_moves_with_the_camera_is_no_match():
     """A photo matched with itself: of what is left, nothing is where the pose puts it."""
-    own = verification.place_keypoints(_problem(), _true_pose(), WORKERS)
-    matches = verification.match_beside(_problem(), own, WORKERS)
-    assert len(matches.query) < 0.2 * len(_problem().photo.seen(WORKERS).keypoints.rays)
-    assert count_matches(matches, _true_pose(), METHOD.cos_agree) == 0
+    own = verification.place_keypoints(narrow_photo.problem(), narrow_photo.true_pose(), WORKERS)
+    matches = verification.match_beside(narrow_photo.problem(), own, WORKERS)
+    assert len(matches.query) < 0.2 * len(narrow_photo.problem().photo.seen(WORKERS).keypoints.rays)
+    assert count_matches(matches, narrow_photo.true_pose(), METHOD.cos_agree) == 0
 
 
 def test_a_mirrored_photo_has_no_matches_beside():
     """It has some without that rule, as many things are symmetric."""
-    taken = Panorama(_narrow()[0].rgb[:, ::-1].copy(), _narrow()[0].is_valid[:, ::-1].copy())
-    mirrored = rooms.ask(taken, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
+    taken = Panorama(
+        narrow_photo.take()[0].rgb[:, ::-1].copy(), narrow_photo.take()[0].is_valid[:, ::-1].copy()
+    )
+    mirrored = rooms.ask(taken, rooms.scan_map(1, narrow_photo.NUM_POINTS), rooms.UNKNOWN)
     own = mirrored.photo.seen(WORKERS).keypoints
-    assert len(matching.match_pictures(own, _beside().keypoints)[0]) > 0
-    assert verification.match_beside(mirrored, _beside(), WORKERS) is NO_MATCHES
+    assert len(matching.match_pictures(own, narrow_photo.beside().keypoints)[0]) > 0
+    assert verification.match_beside(mirrored, narrow_photo.beside(), WORKERS) is NO_MATCHES
 
 
 def test_the_picture_with_the_most_matches_counts():
-    with_other = verification.match_beside(_problem(), _beside(), WORKERS)
-    problem = replace(_problem(), beside=(with_other, NO_MATCHES))
-    found = verification.verify(problem, _true_pose(), _draw(_true_pose()))
-    assert rooms.errors(found.pose, _true_pose())[0] < 0.03
+    with_other = verification.match_beside(narrow_photo.problem(), narrow_photo.beside(), WORKERS)
+    problem = replace(narrow_photo.problem(), beside=(with_other, NO_MATCHES))
+    found = verification.verify(problem, narrow_photo.true_pose(), _draw(narrow_photo.true_pose()))
+    assert rooms.errors(found.pose, narrow_photo.true_pose())[0] < 0.03
     turned = _moved((0.0, 0.0, 0.0), 2.0)
     assert verification.verify(problem, turned, _draw(turned)).num_matches <= 6
-    beside = verification.verify(problem, _true_pose(), NO_MATCHES)
+    beside = verification.verify(problem, narrow_photo.true_pose(), NO_MATCHES)
     assert beside.num_matches >= 20
-    assert rooms.errors(beside.pose, _true_pose())[0] < 0.1
+    assert rooms.errors(beside.pose, narrow_photo.true_pose())[0] < 0.1
 
 
 @functools.lru_cache
 def _beside_its_twin():
     """The problem in a scan of the room and its twin, scanned again, APART from it."""
-    world, cloud = rooms.room(1, NUM_POINTS)
-    points, colors, _ = scan_world(world._replace(seed=99), NUM_POINTS, Workers(2))
+    world, cloud = rooms.room(1, narrow_photo.NUM_POINTS)
+    points, colors, _ = scan_world(world._replace(seed=99), narrow_photo.NUM_POINTS, Workers(2))
     twin = (points - cloud.origin_world).astype(np.float32) + APART
     both = Cloud(np.vstack([cloud.points, twin]), np.vstack([cloud.colors, colors]), cloud.origin_world)
     order = morton_order(both.points, both.colors)
     both = Cloud(both.points[order], both.colors[order], both.origin_world)
-    return rooms.ask(_narrow()[0], prepare_map(rooms.stream(both), Workers(2)), rooms.UNKNOWN)
+    return rooms.ask(narrow_photo.take()[0], prepare_map(rooms.stream(both), Workers(2)), rooms.UNKNOWN)
 
 
 def test_copies_of_a_place_are_where_the_drawn_scan_looks_the_same():
     """Not elsewhere in the twin, nor near in the room."""
     problem = _beside_its_twin()
-    here = problem.scan_map.from_world(_narrow()[1])
+    here = problem.scan_map.from_world(narrow_photo.take()[1])
     moves = [(6.05, 0.0, 0.02), (6.9, -0.8, 0.0), (0.9, -0.8, 0.0)]
     others = [Pose(here.R_cam_from_world, here.center_world + move) for move in moves]
     away = Pose(yaw_rotation(2.0) @ here.R_cam_from_world, here.center_world + APART)
@@ -155,7 +129,7 @@ def test_copies_of_a_place_are_where_the_drawn_scan_looks_the_same():
 
 def test_copies_are_looked_for_among_poses_that_could_win():
     problem = _beside_its_twin()
-    here = problem.scan_map.from_world(_narrow()[1])
+    here = problem.scan_map.from_world(narrow_photo.take()[1])
     twin = Pose(here.R_cam_from_world, here.center_world + APART)
     known = [(here, 0.5, 20), (twin, 0.4, 18), (twin, 0.2, 18)]
     found = make_selection(*(replace(make_candidate(0, *told), pose=pose) for pose, *told in known))
@@ -169,7 +143,7 @@ def test_copies_are_looked_for_among_poses_that_could_win():
 def test_a_copy_of_its_place_that_is_likelier_becomes_the_best(is_copy):
     """The likelier pose is the true one; the best is a little beside its twin, or turned away."""
     problem = _beside_its_twin()
-    here = problem.scan_map.from_world(_narrow()[1])
+    here = problem.scan_map.from_world(narrow_photo.take()[1])
     R = here.R_cam_from_world if is_copy else yaw_rotation(2.0) @ here.R_cam_from_world
     off = Pose(R, here.center_world + APART + np.array([0.15, 0.1, 0.0]))
     found = make_selection(examine(problem, off), examine(problem, here))
@@ -183,7 +157,7 @@ def test_a_copy_of_its_place_that_is_likelier_becomes_the_best(is_copy):
 
 def test_keypoints_on_what_the_scan_does_not_show_are_left_out():
     rng = np.random.default_rng(0)
-    panorama = _problem().photo.panorama
+    panorama = narrow_photo.problem().photo.panorama
     hidden = np.zeros(panorama.is_valid.shape, bool)
     hidden[230:300, 310:390] = True
     assert panorama.is_valid[hidden].all()
@@ -191,29 +165,31 @@ def test_keypoints_on_what_the_scan_does_not_show_are_left_out():
     poster = cv2.resize(rng.integers(0, 255, (14, 16, 3), np.uint8), (80, 70), interpolation=cv2.INTER_CUBIC)
     rgb[230:300, 310:390] = poster
     given = Panorama(rgb, panorama.is_valid)
-    occluded = rooms.ask(given, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
-    for asked, least, most in ((_problem(), 0.5, 1.0), (occluded, 0.0, 0.1)):
+    occluded = rooms.ask(given, rooms.scan_map(1, narrow_photo.NUM_POINTS), rooms.UNKNOWN)
+    for asked, least, most in ((narrow_photo.problem(), 0.5, 1.0), (occluded, 0.0, 0.1)):
         seen = asked.photo.seen(WORKERS).keypoints.rays
-        kept = verification.place_keypoints(asked, _true_pose(), WORKERS).keypoints.rays
-        num_seen, num_kept = (hidden[compute_indices(rays, WIDTH)].sum() for rays in (seen, kept))
+        kept = verification.place_keypoints(asked, narrow_photo.true_pose(), WORKERS).keypoints.rays
+        num_seen, num_kept = (
+            hidden[compute_indices(rays, narrow_photo.WIDTH)].sum() for rays in (seen, kept)
+        )
         assert num_seen > 10
         assert least * num_seen <= num_kept <= most * num_seen
 
 
 def test_the_true_pose_has_many_matches_and_wrong_ones_have_few():
-    right = _verify(_true_pose())
+    right = _verify(narrow_photo.true_pose())
     assert right.num_matches >= 20
-    assert _count(_problem(), _true_pose()) == right.num_matches
+    assert _count(narrow_photo.problem(), narrow_photo.true_pose()) == right.num_matches
     for wrong in (_moved((0.0, 0.0, 0.0), 2.0), _moved((1.0, -0.8, 0.0))):
         assert _verify(wrong).num_matches <= 6
-        assert _count(_problem(), wrong) <= 6
+        assert _count(narrow_photo.problem(), wrong) <= 6
 
 
 def test_a_pose_is_refined_towards_the_truth():
-    off = step(_true_pose(), SMALL)
-    before = rooms.errors(off, _true_pose())
+    off = step(narrow_photo.true_pose(), SMALL)
+    before = rooms.errors(off, narrow_photo.true_pose())
     found = _verify(off)
-    after = rooms.errors(found.pose, _true_pose())
+    after = rooms.errors(found.pose, narrow_photo.true_pose())
     assert after[0] < min(0.02, 0.4 * before[0])
     assert after[1] < 0.4 * before[1]
     assert found.num_matches >= 20
@@ -222,35 +198,38 @@ def test_a_pose_is_refined_towards_the_truth():
 def test_matches_give_a_pose_whose_error_they_cover():
     squares = []
     for offset in (SMALL, -SMALL, 0.0 * SMALL):
-        start = step(_true_pose(), offset)
+        start = step(narrow_photo.true_pose(), offset)
         pose, covariance = verification.place_by_matches(METHOD, start, _draw(start))
-        off = subtract(_true_pose(), pose)
+        off = subtract(narrow_photo.true_pose(), pose)
         squares.append(off @ np.linalg.solve(covariance, off))
-        assert rooms.errors(pose, _true_pose())[0] < 0.03
+        assert rooms.errors(pose, narrow_photo.true_pose())[0] < 0.03
     assert max(squares) < LIKELY
     away = _moved((1.0, -0.8, 0.0))
     assert verification.place_by_matches(METHOD, away, _draw(away)) is None
 
 
 def test_a_pose_is_averaged_with_that_by_its_matches_unless_that_contradicts_the_prior():
-    pose = step(_true_pose(), 0.5 * SMALL)
-    candidate = examine(_problem(), pose)
-    alone = estimate_covariance(_problem(), candidate, WORKERS)
-    found = estimate_errors(_problem(), candidate, WORKERS)
-    assert rooms.errors(found.gaussian.pose, _true_pose())[0] < rooms.errors(pose, _true_pose())[0]
+    pose = step(narrow_photo.true_pose(), 0.5 * SMALL)
+    candidate = examine(narrow_photo.problem(), pose)
+    alone = estimate_covariance(narrow_photo.problem(), candidate, WORKERS)
+    found = estimate_errors(narrow_photo.problem(), candidate, WORKERS)
+    assert (
+        rooms.errors(found.gaussian.pose, narrow_photo.true_pose())[0]
+        < rooms.errors(pose, narrow_photo.true_pose())[0]
+    )
     assert found.std_of_fit == found.gaussian.largest_std < alone.std_of_fit
     moved = found.gaussian.pose.center_world - pose.center_world
     length = float(np.linalg.norm(moved))
     before = Pose(np.eye(3), pose.center_world - moved / length)  # a metre behind
-    near = tuple(_problem().scan_map.to_world(before).center_world)
+    near = tuple(narrow_photo.problem().scan_map.to_world(before).center_world)
     prior = Prior(near=near, radius=1.0 + 0.5 * length - MAX_DISTANCE)
-    told = estimate_errors(replace(_problem(), prior=prior), candidate, WORKERS)
+    told = estimate_errors(replace(narrow_photo.problem(), prior=prior), candidate, WORKERS)
     assert told.gaussian.pose.key == pose.key
 
 
 def test_the_loss_is_that_of_the_averaged_pose():
-    problem = _problem()
-    pose = step(_true_pose(), 0.5 * SMALL)
+    problem = narrow_photo.problem()
+    pose = step(narrow_photo.true_pose(), 0.5 * SMALL)
     candidate = examine(problem, pose)
     measured = measure(problem, make_selection(candidate), None, WORKERS)
     assert measured.pose.key == estimate_errors(problem, candidate, WORKERS).gaussian.pose.key != pose.key
@@ -260,7 +239,7 @@ def test_the_loss_is_that_of_the_averaged_pose():
 
 
 def test_verification_is_the_same_bits_at_any_number_of_threads():
-    poses = [_true_pose(), step(_true_pose(), SMALL), _moved((1.0, -0.8, 0.0))]
+    poses = [narrow_photo.true_pose(), step(narrow_photo.true_pose(), SMALL), _moved((1.0, -0.8, 0.0))]
     for pose in poses:
         a, b = (_verify(pose, Workers(num_threads)) for num_threads in (1, 2))
         assert a.num_matches == b.num_matches
@@ -280,21 +259,21 @@ def test_the_scan_is_drawn_once_for_each_pose_of_the_grid():
         drawn_at = verification.round_pose(near)[1]
         np.testing.assert_allclose(drawn_at.center_world, middle.center_world, atol=1e-12)
         np.testing.assert_allclose(drawn_at.R_cam_from_world, middle.R_cam_from_world, atol=1e-9)
-        assert verification.draw_near(_problem(), near, known, WORKERS) is known
+        assert verification.draw_near(narrow_photo.problem(), near, known, WORKERS) is known
     beside = Pose(middle.R_cam_from_world, middle.center_world + 0.6 * verification.PLACE)
     turned = exp_so3(log_so3(middle.R_cam_from_world) + np.array([0.0, 0.6 * verification.TURN, 0.0]))
     for other in (beside, Pose(turned, middle.center_world)):
-        drawn = verification.draw_near(_problem(), other, known, WORKERS)
+        drawn = verification.draw_near(narrow_photo.problem(), other, known, WORKERS)
         key, drawn_at = verification.round_pose(other)
         assert drawn.key == key != known.key
-        picture = verification.find_all_drawn(_problem(), drawn_at, WORKERS)
-        expected = verification.match_located(_problem().photo.seen(WORKERS).keypoints, picture)
+        picture = verification.find_all_drawn(narrow_photo.problem(), drawn_at, WORKERS)
+        expected = verification.match_located(narrow_photo.problem().photo.seen(WORKERS).keypoints, picture)
         np.testing.assert_array_equal(drawn.matches.points, expected.points)
 
 
 def test_matches_lie_on_the_scan_where_the_photo_sees_them():
     """At the true pose many rays lead to their points, and sizes and tangents are those of the photo."""
-    true = _true_pose()
+    true = narrow_photo.true_pose()
     matches = _draw(true)
     offsets = matches.points - true.center_world
     distances = np.linalg.norm(offsets, axis=1)
@@ -305,7 +284,7 @@ def test_matches_lie_on_the_scan_where_the_photo_sees_them():
     turned = matches.tangents @ true.R_cam_from_world.T
     assert np.median((turned * matches.ray_tangents).sum(axis=1)[fits]) > 0.97
     assert 0.8 < np.median((matches.sizes / distances / matches.angles)[fits]) < 1.25
-    cloud = np.asarray(rooms.room(1, NUM_POINTS)[1].points)
+    cloud = np.asarray(rooms.room(1, narrow_photo.NUM_POINTS)[1].points)
     nearest = [np.linalg.norm(cloud - point, axis=1).min() for point in matches.points]
     assert np.median(nearest) < 0.05
 
@@ -322,9 +301,9 @@ def test_matches_lie_on_the_scan_where_the_photo_sees_them():
 def test_matches_with_which_a_pose_moves_away_are_anothers(offset, yaw_deg, expected):
     """By 0.3 m or 5 degrees."""
     moved = _moved(offset, math.radians(yaw_deg))
-    drawn = Drawn(verification.round_pose(_true_pose())[0], exact_matches(moved, 30))
-    candidate = replace(examine(_problem(), _true_pose()), drawn=drawn)
-    assert count_agreeing(_problem(), candidate, WORKERS).num_matches == expected
+    drawn = Drawn(verification.round_pose(narrow_photo.true_pose())[0], exact_matches(moved, 30))
+    candidate = replace(examine(narrow_photo.problem(), narrow_photo.true_pose()), drawn=drawn)
+    assert count_agreeing(narrow_photo.problem(), candidate, WORKERS).num_matches == expected
 
 
 @pytest.mark.parametrize("offset", [(0.0, -0.4, 0.0), (0.4, 0.4, 0.1), (-0.4, 0.2, 0.0)])
@@ -332,16 +311,16 @@ def test_half_a_metre_off_the_matches_are_those_of_the_true_pose(offset):
     off = _moved(offset, math.radians(8.0))
     found = _verify(off)
     assert found.num_matches >= 12
-    assert rooms.errors(found.pose, _true_pose())[0] < 0.1
-    assert _count(_problem(), off) == 0
+    assert rooms.errors(found.pose, narrow_photo.true_pose())[0] < 0.1
+    assert _count(narrow_photo.problem(), off) == 0
 
 
 def test_the_scan_is_drawn_for_whole_photos_too_but_not_for_whole_views_alone():
-    whole = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
+    whole = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1, narrow_photo.NUM_POINTS), rooms.UNKNOWN)
     assert len(whole.photo.seen(WORKERS).views) == 4
-    assert _count(whole, _true_pose()) > 20
+    assert _count(whole, narrow_photo.true_pose()) > 20
     assert _count(whole, _moved((1.0, 0.5, 0.0))) < 6
-    found = make_selection(examine(whole, _true_pose()))
+    found = make_selection(examine(whole, narrow_photo.true_pose()))
     workers, asked = rooms.listen()
     assert complete(whole.by_views(), found, workers) is found
     assert asked == []
@@ -354,7 +333,7 @@ def test_the_scan_is_drawn_for_whole_photos_too_but_not_for_whole_views_alone():
 )
 def test_a_narrow_photo_of_unknown_gravity_is_found(seed, yaw, most, most_deg):
     """70 degrees of a room, with furniture and pictures in view."""
-    photo, true_pose = _narrow(seed, yaw)
-    found = rooms.locate(photo, rooms.scan_map(seed, NUM_POINTS), rooms.UNKNOWN)
+    photo, true_pose = narrow_photo.take(seed, yaw)
+    found = rooms.locate(photo, rooms.scan_map(seed, narrow_photo.NUM_POINTS), rooms.UNKNOWN)
     assert found.status == "localized"
     rooms.assert_near(found.pose, true_pose, most, most_deg)

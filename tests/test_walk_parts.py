@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 import pytest
 import rooms
-from pictures import encoded, write
+from pictures import encoded, write, write_photo
 from poses import judged
 from refusals import assert_input_error
-from test_priors import write_photo
 
 from piccolo.batch.inputs import times_of
 from piccolo.errors import InputError
@@ -27,6 +26,8 @@ from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.together.walk.frames import MOST_ODDS, Frame, State, list_states
 from piccolo.together.walk.path import NOTHING, Ranked
 from piccolo.together.walk.results import check_odometry, make_localization, smooth_positions
+
+TIER = "scene"
 
 MAX_ACCELERATION = 0.5  # [m/s^2]
 MAX_SPEED = 2.0  # [m/s]

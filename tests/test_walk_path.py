@@ -1,55 +1,18 @@
-"""The path through a walk's key frames, against the sum over every way there is; and lost frames."""
+"""The path through a walk's key frames, against the sum over every way there is."""
 
 import itertools
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from key_frames import MOTION, Open, make_followed, make_key, make_pose
 from refusals import assert_input_error
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, carry, exp_so3, pose_errors, yaw_rotation
-from piccolo.jobs.threads import no_progress
-from piccolo.judge.result import Result
-from piccolo.problem.settings import CoarseToFineSettings
-from piccolo.together.walk import path as walk_path, second_look
-from piccolo.together.walk.frames import JUMP_LOG, MOST_EXPECTED, Frame, Motion, State, check_times
-from piccolo.together.walk.path import NOTHING, Ranked, believe
-from piccolo.together.walk.tracker import Followed, expect
-
-MOTION = Motion(max_speed=1.0)
-
-
-class Open:
-    """Space without walls, of which every place within reach is a share."""
-
-    def __init__(self, share=0.01):
-        self.share = share
-
-    def distances(self, starts, ends, limit):
-        straight = np.linalg.norm(ends[None] - starts[:, None], axis=2)
-        return np.where(straight > limit, np.inf, straight)
-
-    def fraction_within(self, center, radius):
-        return self.share
-
-
-def _pose(*center, yaw=0.0):
-    return Pose(yaw_rotation(yaw), np.array(center, float))
-
-
-def _key(time, *states, departs=0):
-    """A key frame with poses at (x, y, z), each with log odds."""
-    frame = Frame(time, [State(_pose(*center), odds, 0.5) for center, odds in states], "alone", is_key=True)
-    frame.departed = frame.states[departs].pose if frame.states else None
-    return frame
-
-
-def _followed(time, key, center, odds=5.0):
-    """A frame that was tracked from a key frame."""
-    pose = _pose(*center)
-    return Frame(time, [State(pose, odds, 0.5)], "tracked", key=key, arrived=pose)
+from piccolo.together.walk import path as walk_path
+from piccolo.together.walk.frames import JUMP_LOG, MOST_EXPECTED, Frame, Motion, check_times
+from piccolo.together.walk.path import believe
 
 
 def _naive(frames, share):
@@ -94,7 +57,7 @@ def test_probabilities_are_those_of_all_ways_there_are(seed):
     for k in range(4):
         num = rng.integers(1, 4)
         states = [(rng.uniform(0.0, 4.0, 3), float(rng.normal(0.5, 3.0))) for _ in range(num)]
-        frames.append(_key(k + 0.3 * rng.random(), *states))
+        frames.append(make_key(k + 0.3 * rng.random(), *states))
     lattice = walk_path.build_lattice(frames, Open(share), MOTION)
     path = lattice.smooth()
     probabilities = _naive(frames, share)
@@ -107,7 +70,7 @@ def test_probabilities_are_those_of_all_ways_there_are(seed):
 
 def test_places_that_look_alike_share_the_evidence():
     copies = [((9.0 * i, 0, 0), 4.0 - 0.9 * walk_path.COPY_LOG_ODDS * (i > 0)) for i in range(5)]
-    emitted, log_alike = walk_path.emissions(_key(0, *copies, ((99, 0, 0), -8.0)))
+    emitted, log_alike = walk_path.emissions(make_key(0, *copies, ((99, 0, 0), -8.0)))
     np.testing.assert_allclose(emitted[:5], 4.0 - math.log(5.0), atol=1e-3)
     assert log_alike == pytest.approx(math.log(5.0), abs=1e-3)
     assert emitted[5] == pytest.approx(4.0 - 12.0 + walk_path.COPY_LOG_ODDS - log_alike)
@@ -116,26 +79,26 @@ def test_places_that_look_alike_share_the_evidence():
 def test_twin_rooms_are_told_apart_by_the_place_after_them_and_before_it_are_not():
     """Twenty frames in twin rooms, each a little for the wrong one; then a place that there is once."""
     worse = 3.0 - 0.9 * walk_path.COPY_LOG_ODDS
-    twins = [_key(2.0 * k, ((0.1 * k, 0, 0), worse), ((0.1 * k + 20, 0, 0), 3.0)) for k in range(20)]
+    twins = [make_key(2.0 * k, ((0.1 * k, 0, 0), worse), ((0.1 * k + 20, 0, 0), 3.0)) for k in range(20)]
     alone = walk_path.build_lattice(twins, Open(), MOTION).smooth()
     np.testing.assert_allclose([p[0] / p.sum() for p in alone.probabilities], 0.5, atol=0.01)
-    told = walk_path.build_lattice([*twins, _key(41.0, ((2.0, 0, 0), 6.0))], Open(), MOTION).smooth()
+    told = walk_path.build_lattice([*twins, make_key(41.0, ((2.0, 0, 0), 6.0))], Open(), MOTION).smooth()
     assert _chosen(told) == [0] * 21
     assert min(p[0] for p in told.probabilities) > 0.95
 
 
 def test_a_turn_at_its_end_tells_a_twin_corridor_if_the_motion_is_known():
     """Two corridors alike; from the end of each a copy of a room is in reach, 90 degrees apart."""
-    before = _key(0, ((0, 0, 0), 5.0), ((40, 0, 0), 5.0))
-    after = _key(9, ((6, 0, 0), 5.0), ((40, 6, 0), 5.0))
+    before = make_key(0, ((0, 0, 0), 5.0), ((40, 0, 0), 5.0))
+    after = make_key(9, ((6, 0, 0), 5.0), ((40, 6, 0), 5.0))
     unknown = walk_path.build_lattice([before, after], Open(), MOTION).smooth()
     np.testing.assert_allclose(unknown.probabilities[0], 0.5, atol=0.01)
-    after.key, after.arrived = 0, _pose(6, 0, 0)
+    after.key, after.arrived = 0, make_pose(6, 0, 0)
     tracked = walk_path.build_lattice([before, after], Open(), MOTION).smooth()
     assert tracked.probabilities[0][0] > 0.99
     after.key = None
     after.arrived = None
-    before.odometry, after.odometry = _pose(100, 0, 0, yaw=1.0), _pose(100, 0, 0, yaw=1.0)
+    before.odometry, after.odometry = make_pose(100, 0, 0, yaw=1.0), make_pose(100, 0, 0, yaw=1.0)
     turn = yaw_rotation(1.0).T
     after.odometry = Pose(after.odometry.R_cam_from_world, turn @ np.array([6.0, 0, 0]) + [100.0, 0, 0])
     measured = walk_path.build_lattice([before, after], Open(), MOTION).smooth()
@@ -143,7 +106,10 @@ def test_a_turn_at_its_end_tells_a_twin_corridor_if_the_motion_is_known():
 
 
 def test_a_motion_is_carried_to_where_the_camera_is():
-    begin, end = _pose(1, 2, 3, yaw=0.4), Pose(exp_so3(np.array([0.1, 0.2, 1.0])), np.array([2.0, 2.5, 3.0]))
+    begin, end = (
+        make_pose(1, 2, 3, yaw=0.4),
+        Pose(exp_so3(np.array([0.1, 0.2, 1.0])), np.array([2.0, 2.5, 3.0])),
+    )
     to = Pose(exp_so3(np.array([0.3, -0.2, 2.0])), np.array([-5.0, 0.0, 1.0]))
     carried = carry(end, begin, to)
     motion = np.linalg.solve(begin.T_world_from_cam, end.T_world_from_cam)
@@ -153,25 +119,25 @@ def test_a_motion_is_carried_to_where_the_camera_is():
 
 
 def test_known_motions_have_the_error_of_their_length():
-    frames = [_key(0, ((0, 0, 0), 5.0)), _key(1, ((30, 0, 0), 5.0))]
+    frames = [make_key(0, ((0, 0, 0), 5.0)), make_key(1, ((30, 0, 0), 5.0))]
     assert walk_path.motion_between(frames, 0, 1) is None
-    frames[0].odometry, frames[1].odometry = _pose(0, 0, 0), _pose(29, 0, 0)
+    frames[0].odometry, frames[1].odometry = make_pose(0, 0, 0), make_pose(29, 0, 0)
     moved = walk_path.motion_between(frames, 0, 1)
     assert walk_path.is_moved(moved, frames[0].states, frames[1].states).tolist() == [[True]]
-    frames[1].odometry = _pose(27, 0, 0)
+    frames[1].odometry = make_pose(27, 0, 0)
     moved = walk_path.motion_between(frames, 0, 1)
     assert not walk_path.is_moved(moved, frames[0].states, frames[1].states).any()
-    frames[1].odometry = _pose(30, 0, 0, yaw=0.5)
+    frames[1].odometry = make_pose(30, 0, 0, yaw=0.5)
     moved = walk_path.motion_between(frames, 0, 1)
     assert not walk_path.is_moved(moved, frames[0].states, frames[1].states).any()
 
 
 def test_a_jump_has_a_price_and_is_reported():
-    frames = [_key(k, ((k + 50 * (k > 3), 0, 0), 5.0)) for k in range(8)]
+    frames = [make_key(k, ((k + 50 * (k > 3), 0, 0), 5.0)) for k in range(8)]
     path = walk_path.build_lattice(frames, Open(), MOTION).smooth()
     assert _chosen(path) == [0] * 8
     assert path.gaps == [None] * 4 + [walk_path.Gap(51.0, 1.0)] + [None] * 3
-    lonely = [*frames[:4], _key(4, ((54, 0, 0), 2.0)), _key(5, ((5, 0, 0), 5.0))]
+    lonely = [*frames[:4], make_key(4, ((54, 0, 0), 2.0)), make_key(5, ((5, 0, 0), 5.0))]
     path = walk_path.build_lattice(lonely, Open(), MOTION).smooth()
     assert _chosen(path) == [0, 0, 0, 0, None, 0]
     assert path.probabilities[4][0] < 0.01
@@ -181,7 +147,7 @@ def test_a_jump_has_a_price_and_is_reported():
 def test_frames_without_times_may_be_anywhere_and_report_no_gap():
     motions = Motion(), Motion(is_timed=False), Motion(max_speed=3.0, is_timed=False)
     assert [motion.speed for motion in motions] == [2.0, 5.0, 3.0]
-    frames = [_key(k, ((50.0 * k, 0, 0), 1.0)) for k in range(4)]
+    frames = [make_key(k, ((50.0 * k, 0, 0), 1.0)) for k in range(4)]
     path = walk_path.build_lattice(frames, Open(), Motion(is_timed=False)).smooth()
     assert _chosen(path) == [0] * 4
     assert path.gaps == [None] * 4
@@ -189,19 +155,19 @@ def test_frames_without_times_may_be_anywhere_and_report_no_gap():
 
 
 def test_twins_that_are_as_likely_are_no_gap():
-    frames = [_key(3.0 * k, ((k % 2 * 40, 0, 0), 5.0), ((40 - k % 2 * 40, 0, 0), 5.0)) for k in range(5)]
+    frames = [make_key(3.0 * k, ((k % 2 * 40, 0, 0), 5.0), ((40 - k % 2 * 40, 0, 0), 5.0)) for k in range(5)]
     path = walk_path.build_lattice(frames, Open(), MOTION).smooth()
     np.testing.assert_allclose([p.max() for p in path.probabilities], 0.5, atol=0.01)
     assert path.gaps == [None] * 5
 
 
 def test_tracked_frames_are_where_their_key_frame_is_or_are_to_be_tracked_there():
-    frames = [_key(0, ((0, 0, 0), 5.0), ((20, 0, 0), 5.0)), _followed(1, 0, (1, 0, 0)), Frame(2.0)]
-    here = walk_path.build_lattice([*frames, _key(3, ((2, 0, 0), 6.0))], Open(), MOTION)
+    frames = [make_key(0, ((0, 0, 0), 5.0), ((20, 0, 0), 5.0)), make_followed(1, 0, (1, 0, 0)), Frame(2.0)]
+    here = walk_path.build_lattice([*frames, make_key(3, ((2, 0, 0), 6.0))], Open(), MOTION)
     belief = believe(here.frames, here.smooth(), 1)
     assert belief.is_sure
     assert belief.states[0] is frames[1].states[0]
-    there = walk_path.build_lattice([*frames, _key(3, ((22, 0, 0), 6.0))], Open(), MOTION)
+    there = walk_path.build_lattice([*frames, make_key(3, ((22, 0, 0), 6.0))], Open(), MOTION)
     belief = believe(there.frames, there.smooth(), 1)
     assert not belief.is_sure
     np.testing.assert_allclose(belief.expected.center_world, [21.0, 0.0, 0.0])
@@ -211,8 +177,8 @@ def test_tracked_frames_are_where_their_key_frame_is_or_are_to_be_tracked_there(
 
 
 def test_a_tracked_frame_before_a_contradiction_is_less_sure():
-    frames = [_key(0, ((0, 0, 0), 8.0)), _followed(1, 0, (1, 0, 0)), _key(2, ((70, 0, 0), 5.0))]
-    frames[2].key, frames[2].arrived = 0, _pose(2, 0, 0)
+    frames = [make_key(0, ((0, 0, 0), 8.0)), make_followed(1, 0, (1, 0, 0)), make_key(2, ((70, 0, 0), 5.0))]
+    frames[2].key, frames[2].arrived = 0, make_pose(2, 0, 0)
     lattice = walk_path.build_lattice(frames, Open(), MOTION)
     path = lattice.smooth()
     assert _chosen(path) == [0, None, None]
@@ -220,9 +186,9 @@ def test_a_tracked_frame_before_a_contradiction_is_less_sure():
 
 
 def test_live_probabilities_are_those_of_the_last_key_frame_that_is_tracked_from():
-    frames = [_key(0, ((0, 0, 0), 5.0)), _key(1, ((70, 0, 0), -1.0), ((90, 0, 0), -2.0))]
+    frames = [make_key(0, ((0, 0, 0), 5.0)), make_key(1, ((70, 0, 0), -1.0), ((90, 0, 0), -2.0))]
     frames[1].departed = None
-    lattice = walk_path.build_lattice([*frames, _followed(2, 0, (2, 0, 0))], Open(), MOTION)
+    lattice = walk_path.build_lattice([*frames, make_followed(2, 0, (2, 0, 0))], Open(), MOTION)
     path = lattice.filter_path()
     assert _chosen(path) == [0, None, None]
     assert believe(lattice.frames, path, 1).states[0] is frames[1].states[0]
@@ -233,12 +199,12 @@ def test_live_probabilities_are_those_of_the_last_key_frame_that_is_tracked_from
 def test_tracking_is_known_by_way_of_later_key_frames():
     """The second key frame was left from another place than it was tracked to: its twin."""
     frames = [
-        _key(0, ((0, 0, 0), 5.0)),
-        _key(1, ((1, 0, 0), 5.0), ((31, 0, 0), 5.0), departs=1),
-        _key(2, ((2, 0, 0), 5.0), ((32, 0, 0), 5.0)),
+        make_key(0, ((0, 0, 0), 5.0)),
+        make_key(1, ((1, 0, 0), 5.0), ((31, 0, 0), 5.0), departs=1),
+        make_key(2, ((2, 0, 0), 5.0), ((32, 0, 0), 5.0)),
     ]
-    frames[1].key, frames[1].arrived = 0, _pose(1, 0, 0)
-    frames[2].key, frames[2].arrived = 1, _pose(32, 0, 0)
+    frames[1].key, frames[1].arrived = 0, make_pose(1, 0, 0)
+    frames[2].key, frames[2].arrived = 1, make_pose(32, 0, 0)
     begin, end, _ = walk_path.motion_between(frames, 0, 2)
     np.testing.assert_allclose(end.center_world - begin.center_world, [2.0, 0.0, 0.0])
     lattice = walk_path.build_lattice(frames, Open(), MOTION)
@@ -251,18 +217,22 @@ def test_tracking_is_known_by_way_of_later_key_frames():
 
 
 def test_frames_tracked_from_a_dark_key_frame_speak_for_it_when_they_are_known():
-    dark = _key(0, ((0, 0, 0), -1.0))
+    dark = make_key(0, ((0, 0, 0), -1.0))
     alone = walk_path.build_lattice([dark], Open(), MOTION).smooth()
     assert alone.probabilities[0][0] == pytest.approx(1.0 / (1.0 + math.e))
-    told = walk_path.build_lattice([dark, _followed(1, 0, (1, 0, 0), 4.0)], Open(), MOTION).smooth()
+    told = walk_path.build_lattice([dark, make_followed(1, 0, (1, 0, 0), 4.0)], Open(), MOTION).smooth()
     assert told.probabilities[0][0] == pytest.approx(1.0 / (1.0 + math.exp(-4.0)))
 
 
 def test_frames_that_name_each_other_as_key_frames_measure_nothing():
     """A frame that hangs on a later key frame may have been the key frame of that one before."""
-    frames = [_key(0.0, ((0, 0, 0), 5.0)), _followed(1.0, 2, (1, 0, 0)), _followed(2.0, 1, (2, 0, 0))]
+    frames = [
+        make_key(0.0, ((0, 0, 0), 5.0)),
+        make_followed(1.0, 2, (1, 0, 0)),
+        make_followed(2.0, 1, (2, 0, 0)),
+    ]
     for frame in frames[1:]:
-        frame.departed = _pose(0, 0, 0)
+        frame.departed = make_pose(0, 0, 0)
     assert walk_path.motion_between(frames, 0, 2) is None
     assert walk_path.motion_between(frames, 0, 1) is None
 
@@ -275,160 +245,9 @@ def test_refusals():
     assert_input_error(r"^`max_speed`: found -1.0, wanted a number above 0$", Motion, max_speed=-1.0)
 
 
-TIMES = (9.0, 9.5, 10.0, 12.0)  # the third is lost
-LOST = 2
-
-
-def _at(x):
-    return Pose(np.eye(3), np.array([x, 0.0, 0.0]))
-
-
-@pytest.fixture
-def walk():
-    """Key frames along a line at 1 m/s, of which one is lost; and what is believed of each."""
-    sure = [State(_at(time), 8.0, 0.5) for time in TIMES]
-    both = zip(TIMES, sure, strict=True)
-    frames = [Frame(time, [state], is_key=True, departed=state.pose) for time, state in both]
-    frames[LOST] = Frame(TIMES[LOST])
-    beliefs = [Ranked([state], np.array([0.99])) for state in sure]
-    beliefs[LOST] = NOTHING
-    probabilities = [belief.probabilities for belief in beliefs]
-
-    def find(problem, frame, near):
-        expected = expect(frame, [(frames[k], pose) for k, pose in near], Motion())
-        return second_look.find_near(problem, expected, None)
-
-    about = {"find": find, "problem_of": lambda k: k, "means": None}
-    tracker = SimpleNamespace(frames=frames, motion=Motion(), settings=CoarseToFineSettings(), **about)
-    return tracker, walk_path.Path(probabilities, [None] * len(frames)), beliefs
-
-
-def _find(walk, monkeypatch, x, how="near", is_alone=True):
-    """Look for the lost frame, which is found at a place; return it, and where it was expected."""
-    asked = []
-
-    def find(problem, expected, means):
-        asked.append(expected)
-        return Followed(State(_at(x), 5.0, 0.5), how, is_alone)
-
-    monkeypatch.setattr(second_look, "find_near", find)
-    tracker, path, beliefs = walk
-    second_look._find_lost(tracker, path, beliefs, LOST)
-    return tracker.frames[LOST], asked
-
-
-def test_a_lost_frame_is_expected_from_the_sure_frames_nearest_in_time(walk, monkeypatch):
-    frame, asked = _find(walk, monkeypatch, 10.1)
-    assert [expected.last.center_world[0] for expected in asked] == [9.5]
-    assert asked[0].pose.center_world[0] == pytest.approx(10.0)
-    assert asked[0].reach == Motion().reach(0.5)
-    assert (frame.key, frame.how, frame.is_key) == (1, "near", False)
-    assert frame.arrived.center_world[0] == pytest.approx(10.1)
-    assert walk[2][LOST].states[0].pose.center_world[0] == pytest.approx(10.1)
-
-
-@pytest.mark.parametrize(("x", "is_alone"), [(7.5, True), (10.1, False)])
-def test_a_place_out_of_reach_or_one_of_several_is_none(walk, monkeypatch, x, is_alone):
-    """From the frame after it, at 12 m, one at 7.5 m could not have been reached in 2 s."""
-    frame, asked = _find(walk, monkeypatch, x, "near", is_alone)
-    assert len(asked) == 1
-    assert frame == Frame(TIMES[LOST])
-    assert walk[2][LOST] is NOTHING
-
-
-def test_a_sure_frame_is_not_looked_for(walk, monkeypatch):
-    walk[2][LOST] = walk[2][1]
-    assert _find(walk, monkeypatch, 10.1)[1] == []
-
-
-def test_a_frame_tracked_in_a_copy_is_tracked_where_it_is_expected(walk, monkeypatch):
-    """Whatever looks like that place near it."""
-    expected = _at(10.2)
-    tracker, _, beliefs = walk
-    tracker.frames[LOST].key = 1
-    beliefs[LOST] = Ranked([State(expected, 4.0)], np.array([0.5]), expected)
-    frame, asked = _find(walk, monkeypatch, 10.1, "tracked", is_alone=False)
-    assert asked[0].pose is expected
-    assert frame.arrived.center_world[0] == pytest.approx(10.1)
-
-
-@pytest.mark.parametrize(
-    ("probabilities", "is_refined", "listed"),
-    [
-        ([0.95, 0.04], [True, False], []),
-        ([0.8, 0.15], [True, False], [1]),
-        ([0.87, 0.05, 0.08], [True, False, False], [2]),
-        ([0.7, 0.06, 0.09, 0.08, 0.07], [True] + 4 * [False], [2, 3, 4]),
-        ([0.86, 0.09, 0.02, 0.02], [True, False, False, False], [1]),
-        ([0.4, 0.09, 0.09], [True, False, False], []),
-        ([0.04, 0.4, 0.3], [True, False, False], [1, 2]),
-    ],
-)
-def test_rough_places_are_refined_if_they_leave_another_unsure(probabilities, is_refined, listed):
-    """Of those that do so together, as many as leave it sure without them."""
-    states = [State(_at(5.0 * k), 1.0, 0.5 if r else None) for k, r in enumerate(is_refined)]
-    tracker = SimpleNamespace(frames=[Frame(0.0, states, is_key=True)])
-    path = walk_path.Path([np.array(probabilities)], [None])
-    assert second_look._list_rough(tracker, path, 0) == listed
-
-
-def test_frames_that_are_not_sure_are_searched_some_of_each_run():
-    sure, unsure = Ranked([State(_at(0.0), 8.0, 0.5)], np.array([0.99])), NOTHING
-    frames = [Frame(float(k)) for k in range(60)]
-    beliefs = [unsure] * 2 + [sure] + [unsure] * 57
-    assert second_look.list_unsure(frames, beliefs, 0.9) == [0, 1, *range(5, 60, 5)]
-    frames[1].alone = Result()
-    assert second_look.list_unsure(frames, beliefs, 0.9)[:2] == [0, 5]
-    assert second_look.list_unsure(frames[:3], [sure] * 3, 0.999) == [0, 2]
-
-
-@pytest.mark.parametrize(
-    ("x", "is_sure", "is_tracked", "is_taken"),
-    [
-        (10.1, True, True, True),
-        (10.1, False, True, False),
-        (10.1, False, False, True),
-        (30.0, True, False, False),
-    ],
-)
-def test_a_frame_that_is_sure_alone_joins_the_walk_if_it_is_within_reach(
-    walk, x, is_sure, is_tracked, is_taken
-):
-    tracker, _, beliefs = walk
-    before = tracker.frames[LOST]
-    before.states = [State(_at(10.2), 1.0, 0.5)] if is_tracked else []
-    alone = Result("localized" if is_sure else "ambiguous")
-
-    def search(problem, frame):
-        frame.alone = alone
-        frame.states = [State(_at(x), 4.0, 0.5)]
-        frame.is_key = True
-
-    tracker.search = search
-    assert second_look._search_unsure(tracker, beliefs, no_progress) == is_taken
-    assert tracker.frames[LOST].is_key == is_taken
-    assert tracker.frames[LOST].alone is alone
-    assert (tracker.frames[LOST] is before) != is_taken
-
-
-def test_a_pose_that_found_a_frame_before_stays_if_it_is_likelier(walk, monkeypatch):
-    tracker, path, beliefs = walk
-    tracker.frames[LOST] = _followed(TIMES[LOST], 1, (10, 0, 0), 2.0)
-    beliefs[LOST] = believe(tracker.frames, path, LOST)
-    assert 0.8 < beliefs[LOST].confidence < 0.9
-    before = tracker.frames[LOST]
-
-    def find_worse(problem, frame, near):
-        return Followed(State(_at(10.1), 1.0, 0.5), "tracked", True)
-
-    tracker.find = find_worse
-    second_look._find_lost(tracker, path, beliefs, LOST)
-    assert tracker.frames[LOST] is before
-
-
 def test_doubtful_frames_that_look_elsewhere_add_up():
     """Each is right with 0.83 by itself; the photos were tracked from each other."""
-    frames = [_key(float(k), ((k, 0, 0), 1.6), ((40 + k, 9 * k, 0), -6.0)) for k in range(4)]
+    frames = [make_key(float(k), ((k, 0, 0), 1.6), ((40 + k, 9 * k, 0), -6.0)) for k in range(4)]
     for k, frame in enumerate(frames[1:]):
         frame.key, frame.arrived = k, frame.states[0].pose
     sure = [

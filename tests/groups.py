@@ -1,0 +1,16 @@
+"""Photos of one place that overlap, each with its true pose."""
+
+import functools
+
+import numpy as np
+import rooms
+
+SEED = 5
+TURN = (6.75, 7.0, 7.25)  # eighths, of photos of 75 degrees that overlap: none is sure alone
+
+
+@functools.lru_cache
+def taken_photos():
+    """Photos with their true poses."""
+    offsets = {k: np.random.default_rng(int(10 * k)).uniform(-0.2, 0.2, 3) for k in TURN}
+    return rooms.take_photos(SEED, 75.0, offsets, 1024)
