@@ -16,6 +16,7 @@ from .judge.result_parts import (
 from .opening import Cloud as Cloud, open_scan as open_scan
 from .paper.localize import PaperSettings as PaperSettings
 from .photo import GpsPrior as GpsPrior, Photo as Photo, Prior as Prior
+from .problem.accuracy import Accuracy as Accuracy
 from .problem.settings import CoarseToFineSettings as CoarseToFineSettings
 from .report.build import ReportSettings as ReportSettings, write_report as write_report
 from .scan import Scan as Scan

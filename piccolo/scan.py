@@ -23,6 +23,7 @@ from .localization.means import NO_TRACE, Trace
 from .paper.localize import PaperMap
 from .photo import File, Photo, Prior, as_photo
 from .photo_reader import PhotoReader, Settings
+from .problem.accuracy import Accuracy
 from .problem.settings import CoarseToFineSettings
 from .scan_bundle import AskedPosed, localize_posed
 from .scan_coloring import color_by
@@ -39,6 +40,7 @@ from .together.walk.frames import Motion
 from .together.walk.tracker import Tracker
 
 BESIDE = "photos beside others"
+OPTIONS = "prior", "gravity", "accuracy", "min_confidence"  # of photos
 ONLY_DEFAULT = ("refine_focal", "gravity_vector")  # options of photos that the preset paper does not have
 Picture = File | Bytes | Photo  # a path or an array (H, W, 3) is a photo without options
 
@@ -48,9 +50,9 @@ class Scan:
     """A scan in which photos can be localized: `open_scan` returns it. Several threads may use it at once.
 
     Its methods share the options `prior` (by default nothing is known), `gravity` ("known": the camera was
-    upright, or as the photo says; "unknown": any rotation; "auto": both are tried) and `min_confidence`, the
-    least confidence of a pose that is called localized. One that is None is that of the `settings` of
-    `open_scan`, by default "auto" and 0.9.
+    upright, or as the photo says; "unknown": any rotation; "auto": both are tried), `accuracy`, how exact a
+    pose must be, and `min_confidence`, the least probability that one is, if it is called localized. One that
+    is None is that of the `settings` of `open_scan`, by default "auto", 0.1 m and 5 degrees, 0.9.
     """
 
     prepared: ScanMap | PaperMap  # for the method that the settings belong to
@@ -104,19 +106,13 @@ class Scan:
         *,
         prior: Prior | None = None,
         gravity: Gravity | None = None,
+        accuracy: Accuracy | None = None,
         min_confidence: float | None = None,
     ) -> Result:
         """Find the position and rotation of the camera that took a photo.
 
-        Returns
-        -------
-        Result
-            Its `status` is "localized", "ambiguous" or "not_localized"; not to be found is no error.
-
-        Raises
-        ------
-        InputError
-            The picture can't be read, or an option is invalid.
+        The `status` of the result is "localized", "ambiguous" or "not_localized"; not to be found is no
+        error. Raises InputError for a picture that can't be read, and for an option that is invalid.
 
         Examples
         --------
@@ -129,7 +125,8 @@ class Scan:
         >>> scan.localize(photo, prior=piccolo.Prior(height=(1.0, 1.5))).status
         'localized'
         """
-        return self.localize_photo(Asked(as_photo(photo), self._change(prior, gravity, min_confidence)))
+        settings = self._change(prior, gravity, accuracy, min_confidence)
+        return self.localize_photo(Asked(as_photo(photo), settings))
 
     def localize_photo(
         self, asked: Asked, focal: FocalLength | None = None, trace: Trace = NO_TRACE
@@ -144,6 +141,7 @@ class Scan:
         *,
         prior: Prior | Sequence[Prior | None] | None = None,
         gravity: Gravity | None = None,
+        accuracy: Accuracy | None = None,
         min_confidence: float | None = None,
     ) -> Iterator[Result]:
         """Return an iterator over the results of photos, in order; each is computed when it is asked for.
@@ -163,9 +161,10 @@ class Scan:
         if isinstance(prior, Sequence):
             photos = list(photos)
             check_one_each("prior", prior, len(photos), "photo")
-        settings = self._change(None, gravity, min_confidence)  # refused before the first photo is asked for
+        # refused before the first photo is asked for
+        settings = self._change(None, gravity, accuracy, min_confidence)
         own = (
-            Asked(as_photo(photo), self._change(prior, gravity, min_confidence))
+            Asked(as_photo(photo), self._change(prior, gravity, accuracy, min_confidence))
             for photo, prior in zip(photos, priors, strict=False)
         )
         if not may_help:
@@ -220,6 +219,7 @@ class Scan:
         relative_scale: RelativeScale = "metres",
         prior: Prior | None = None,
         gravity: Gravity | None = None,
+        accuracy: Accuracy | None = None,
         min_confidence: float | None = None,
     ) -> list[Result]:
         """Localize photos together whose poses relative to each other are known.
@@ -233,7 +233,7 @@ class Scan:
         check_kind("relative_scale", relative_scale, RelativeScale)
         given = [as_photo(photo) for photo in photos]
         check_one_each("relative_poses", relative_poses, len(given), "photo")
-        settings = self._change(prior, gravity, min_confidence)
+        settings = self._change(prior, gravity, accuracy, min_confidence)
         scan_map, settings = self.require_default_method("`relative_poses`", settings)
         for photo in given:
             self.check_options(photo, settings)
@@ -250,6 +250,7 @@ class Scan:
         *,
         prior: Prior | None = None,
         gravity: Gravity | None = None,
+        accuracy: Accuracy | None = None,
         min_confidence: float | None = None,
     ) -> Coloring:
         """Localize photos, again in each other's colours, and write the scan in their colours to `out`.
@@ -258,7 +259,7 @@ class Scan:
         """
         check_kind("photos", photos, Iterable[Picture])
         check_kind("out", out, File)
-        settings = self._change(prior, gravity, min_confidence)
+        settings = self._change(prior, gravity, accuracy, min_confidence)
         scan_map, settings = self.require_default_method("color", settings)
         asked = [Asked(as_photo(photo), settings) for photo in photos]
 
@@ -273,6 +274,7 @@ class Scan:
         *,
         prior: Prior | None = None,
         gravity: Gravity | None = None,
+        accuracy: Accuracy | None = None,
         min_confidence: float | None = None,
     ) -> list[Result]:
         """Localize photos that were taken at one place or on a short way, in any order, by what they share.
@@ -281,7 +283,7 @@ class Scan:
         says so. `beside` of a result names those that it was localized with.
         """
         check_kind("photos", photos, Iterable[Picture])
-        settings = self._change(prior, gravity, min_confidence)
+        settings = self._change(prior, gravity, accuracy, min_confidence)
         scan_map, settings = self.require_default_method("photos together", settings)
         asked = [AskedTogether(as_photo(photo), settings) for photo in photos]
         for one in asked:
@@ -294,6 +296,7 @@ class Scan:
         motion: Motion | None = None,
         prior: Prior | None = None,
         gravity: Gravity | None = None,
+        accuracy: Accuracy | None = None,
         min_confidence: float | None = None,
     ) -> Walk:
         """Track a camera that is carried through the scan, frame by frame.
@@ -306,7 +309,7 @@ class Scan:
             result of each frame, from all frames.
         """
         check_kind("motion", motion, Motion | None)
-        settings = self._change(prior, gravity, min_confidence)
+        settings = self._change(prior, gravity, accuracy, min_confidence)
         scan_map, settings = self.require_default_method("walks", settings)
         check_within(scan_map, settings.prior.within)
         quiet = Workers(self.workers.num_threads, warn=self.workers.warn)
@@ -321,6 +324,7 @@ class Scan:
         motion: Motion | None = None,
         prior: Prior | None = None,
         gravity: Gravity | None = None,
+        accuracy: Accuracy | None = None,
     ) -> list[Result]:
         """Localize the frames of a walk together: each frame restricts the poses of the others.
 
@@ -332,18 +336,11 @@ class Scan:
             Time of each frame [s], increasing. Without times only the order counts.
         odometry
             Pose of the camera at each frame in any common frame [m], or None.
-        motion, prior, gravity
+        motion, prior, gravity, accuracy
             As in `track`.
 
-        Returns
-        -------
-        list of Result
-            One for each frame, in order; `walk` says how its pose was found.
-
-        Raises
-        ------
-        InputError
-            Times and frames differ in number, times do not increase, or an option is invalid.
+        `walk` of a result says how its pose was found. Raises InputError if times and frames differ in
+        number, times do not increase, or an option is invalid.
 
         Examples
         --------
@@ -353,7 +350,7 @@ class Scan:
         >>> [result.status for result in scan.localize_walk(frames, times=[0.0, 5.0])]
         ['localized', 'localized']
         """
-        walk = self.track(motion=motion, prior=prior, gravity=gravity)
+        walk = self.track(motion=motion, prior=prior, gravity=gravity, accuracy=accuracy)
         check_kind("frames", frames, Iterable[Picture])
         check_kind("times", times, Sequence[float] | Floats | None)
         check_kind("odometry", odometry, Sequence[Pose | None] | None)
@@ -389,10 +386,9 @@ class Scan:
             raise InputError(f"{what}: not available with the preset paper")
         return self.prepared, settings
 
-    def _change(self, prior: Prior | None, gravity: Gravity | None, min_confidence: float | None) -> Settings:
-        """Return the settings of `open_scan` with options that are not None in place of its own."""
-        options: dict[str, Any] = {"prior": prior, "gravity": gravity, "min_confidence": min_confidence}
-        given = {name: value for name, value in options.items() if value is not None}
+    def _change(self, *options: Any) -> Settings:
+        """Return the settings of `open_scan` with OPTIONS that are not None in place of its own."""
+        given = {name: value for name, value in zip(OPTIONS, options, strict=True) if value is not None}
         settings = self.settings
         if unknown := given.keys() - {f.name for f in fields(settings)}:
             raise InputError(f"`{min(unknown)}`: not an option of the preset paper")

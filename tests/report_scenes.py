@@ -11,6 +11,7 @@ import numpy as np
 from piccolo.cli import report
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
+from piccolo.judge.belief import make_belief
 from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.judge.result import Result
 from piccolo.judge.result_parts import Alternative, Evidence, Gap, Source, WalkFrame
@@ -92,9 +93,11 @@ def result_of(path, pose, status="localized", confidence=None, alternatives=()):
         return unreadable_result(f"{path}: no picture", "house.npz", str(path), settings={})
     likely = {"localized": 0.995, "ambiguous": 0.55, "not_localized": 0.12}[status]
     spread = np.diag([1e-7, 1e-7, 1e-7, 4e-6, 1e-6, 1e-6]) * (1 if status == "localized" else 2500)
+    likely = likely if confidence is None else confidence
     return Result(
         status=status,
-        confidence=likely if confidence is None else confidence,
+        confidence=likely,
+        belief=make_belief([likely, *(p for _, p in alternatives)]),
         cloud="house.npz",
         pano=str(path),
         best_pose=pose,

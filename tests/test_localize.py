@@ -108,6 +108,23 @@ def test_files_are_written_and_look_right(scene, tmp_path, capsys):
     assert (checkerboard[tile[1]] == cloud[tile[1]]).all()
 
 
+def test_a_pose_must_be_as_exact_as_the_user_says(scene, tmp_path, capsys):
+    """The place is certain all the same: a line says which accuracy would accept the pose."""
+    out = tmp_path / "poses.jsonl"
+    assert localize.main(_arguments(scene, "--out", str(out), "--accuracy", "0.0001")) == 1
+    told = capsys.readouterr().err
+    found = Result.from_json(out.read_text())
+    assert (found.status, found.best_guess is None) == ("not_localized", False)
+    assert found.place_probability > 0.9
+    assert found.confidence < 0.1
+    assert found.hint.startswith("the place is certain, the position only to ")
+    assert found.hint.replace("`accuracy`", "--accuracy") in told
+    assert "look at the --overlay" not in told
+    assert localize.main(_arguments(scene, "--out", str(out))) == 3
+    assert "made with --accuracy 0.0001 5, now --accuracy 0.1 5" in capsys.readouterr().err
+
+
+WANTS_MORE = {"accuracy": {"metres": 0.001, "degrees": 5.0}, "min_confidence": 0.9}
 GUESSED = FocalLength(700.0, 9.0, 804.0, 160.8)
 
 
@@ -115,19 +132,26 @@ GUESSED = FocalLength(700.0, 9.0, 804.0, 160.8)
     ("change", "advice"),
     [
         ({"status": "localized"}, []),
-        ({"status": "ambiguous", "confidence": 0.05}, ["  to decide, give --near or --heading"]),
-        ({"confidence": 0.1}, ["  to be sure, look at the --overlay, give --near"]),
-        ({"status": "ambiguous", "confidence": 0.5, "focal_length": GUESSED}, ["  if other photos of this"]),
-        ({"confidence": 0.09}, ["  it fits nowhere well: another scan, or bare walls?"]),
+        ({"status": "ambiguous", "belief": make_belief([0.05])}, ["  to decide, give --near or --heading"]),
+        ({"belief": make_belief([0.1])}, ["  to be sure, look at the --overlay, give --near"]),
         (
-            {"confidence": 0.09, "cameras": (Mount(pinhole(4, 3, 4.0)),)},
+            {"status": "ambiguous", "belief": make_belief([0.5]), "focal_length": GUESSED},
+            ["  if other photos of this"],
+        ),
+        ({"belief": make_belief([0.09])}, ["  it fits nowhere well: another scan, or bare walls?"]),
+        (
+            {"belief": make_belief([0.09]), "cameras": (Mount(pinhole(4, 3, 4.0)),)},
             ["  it fits nowhere .* focal length"],
         ),
         (
             {"confidence": 0.0, "belief": make_belief([0.9]).rule_out(Reason.MIRRORED)},
             [],
         ),  # a warning says why
-        ({"confidence": 0.5, "settings": {"preset": "paper"}}, []),
+        ({"belief": make_belief([0.5]), "settings": {"preset": "paper"}}, []),
+        (
+            {"belief": make_belief([0.99]), "settings": WANTS_MORE},
+            ["  the place is certain, .*: --accuracy 0.0"],
+        ),
     ],
 )
 def test_a_doubtful_result_says_what_to_do(change, advice):
@@ -183,7 +207,7 @@ def test_usage_and_version(capsys):
             localize.main(words.split())
         assert stop.value.code == code
     text = capsys.readouterr().out
-    assert len(re.findall("^  -", text, flags=re.MULTILINE)) <= 49
+    assert len(re.findall("^  -", text, flags=re.MULTILINE)) <= 50
 
 
 @pytest.mark.process

@@ -18,8 +18,6 @@ from piccolo.geometry.pose_gaussian import (
     differentiate,
     differentiate_rays,
     mean_of,
-    probability_near,
-    probability_within,
     subtract,
 )
 
@@ -251,18 +249,3 @@ def test_contradictory_poses_leave_a_mean_with_larger_errors():
 def test_means_of_covariances():
     assert not mean_of([]).any()
     np.testing.assert_allclose(mean_of([np.eye(6), 3.0 * np.eye(6)]), 2.0 * np.eye(6))
-
-
-def test_probabilities_within_a_distance():
-    assert probability_within(None) == 1.0
-    along = np.diag([0.0, 0.0, 0.0, 0.05**2, 0.0, 0.0])
-    found = PoseGaussian(poses.Pose(np.eye(3), np.zeros(3)), 0.5 * along, 0.5 * along)
-    assert probability_within(found) == pytest.approx(0.9545, abs=1e-4)
-    assert probability_within(found.widen(np.diag([0.0] * 4 + [0.05**2] * 2))) == pytest.approx(
-        0.7385, abs=1e-4
-    )
-    here = np.zeros(3)
-    assert probability_near(here, along[3:, 3:]) == pytest.approx(probability_within(found), abs=1e-3)
-    away = np.array([0.2, 0.0, 0.0])
-    assert probability_near(away, 0.01**2 * np.eye(3)) < 1e-6
-    assert probability_near(away, 0.3**2 * np.eye(3)) < probability_near(here, 0.3**2 * np.eye(3))

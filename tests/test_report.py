@@ -216,9 +216,11 @@ def test_results_of_another_scan_are_refused_or_told_of_on_the_page(house, tmp_p
 
 
 def test_hopeless_guesses_are_on_no_plan(house, tmp_path):
+    """However exact a likely one is."""
     scene, _ = house
     guesses = ((0, 0.003), (2, 0.3))
-    results = [replace(scene.results[k], status="not_localized", confidence=c) for k, c in guesses]
+    unsure = ({"status": "not_localized", "confidence": 0.01, "belief": make_belief([c])} for _, c in guesses)
+    results = [replace(scene.results[k], **how) for (k, _), how in zip(guesses, unsure, strict=True)]
     lines = write_results(tmp_path / "poses.jsonl", results)
     words = ["--results", str(lines), "--cloud", str(scene.cloud), "--quiet"]
     assert report.main([*words, "--out", str(tmp_path / "r"), "--plan", str(tmp_path / "p.svg")]) == 0
@@ -231,7 +233,12 @@ def test_what_contradicts_a_result_is_told_apart(house, tmp_path):
     scene, _ = house
     told = [{Reason.HEADING, Reason.NEAR}, {Reason.CALIBRATION}, {Reason.MIRRORED}, set()]
     results = [
-        replace(result, status="not_localized", confidence=0.0, belief=make_belief([0.9]).rule_out(*reasons))
+        replace(
+            result,
+            status="not_localized",
+            confidence=0.0,
+            belief=make_belief([0.9 if reasons else 0.0]).rule_out(*reasons),
+        )
         for result, reasons in zip(scene.results, told, strict=False)
     ]
     results.append(scene.results[0])

@@ -37,7 +37,7 @@ def test_json_names_what_the_next_tool_needs_in_its_units():
     assert document["std_mm"] == pytest.approx([2.0, 3.0, 4.0])
     assert document["std_deg"] == pytest.approx([np.degrees(1e-3)] * 3)
     assert "R_true = exp([w]x) R_cam_from_world" in document["covariance_convention"]
-    assert document["format"] == "piccolo-pose/12"
+    assert document["format"] == "piccolo-pose/13"
     assert (document["storey"], document["height_above_floor_m"]) == (2, 1.51)
     T = np.array(document["T_world_from_cam"])
     np.testing.assert_allclose(T[:3, 3], RESULT.pose.center_world)
@@ -133,4 +133,4 @@ def test_several_files_of_a_cloud_are_a_list():
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", *(f'{{"format": "piccolo-pose/{k}"}}' for k in (3, 10))])
 def test_other_text_is_refused(text):
-    assert_input_error("piccolo-pose/12", Result.from_json, text)
+    assert_input_error("piccolo-pose/13", Result.from_json, text)

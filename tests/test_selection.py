@@ -23,6 +23,7 @@ from piccolo.localization.judging import Found, judge
 from piccolo.localization.ladder import FINE, refine
 from piccolo.localization.last_descent import refine_best
 from piccolo.panorama.texels import pack_texels
+from piccolo.problem.settings import CoarseToFineSettings
 
 TIER = "scene"
 
@@ -227,7 +228,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere():
     def judged(*candidates, rival_ratio=0.0, asked=problem):
         selection = make_selection(*candidates, rival_ratio=rival_ratio)
         selection = complete(asked, selection, rooms.WORKERS)
-        return judge(Found(asked, selection, None), rooms.means(), 0.9)
+        return judge(Found(asked, selection, None), rooms.means(), CoarseToFineSettings().demand)
 
     found = judged(best, *others, rival_ratio=0.3)
     e = found.evidence

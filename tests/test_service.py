@@ -81,6 +81,19 @@ def test_options_count(service, photo):
     assert found["settings"]["gravity"] == "known"
 
 
+def test_a_request_says_how_exact_a_pose_must_be(service, photo, expected):
+    """The place is as certain as ever; metres alone leave degrees as the service has them."""
+    status, _, body = service.post("/show", "a.jpg", photo, {"accuracy": {"metres": 0.0001}})
+    assert status == 200
+    shown, _ = map(json.loads, body.decode().splitlines())
+    found = shown["result"]
+    assert found["settings"]["accuracy"] == {"metres": 0.0001, "degrees": 5.0}
+    assert (found["status"], found["place_probability"]) == ("not_localized", expected["place_probability"])
+    assert found["hint"] == shown["photo"]["hint"]
+    assert found["hint"].endswith("`accuracy` 0.01 would accept it")
+    assert shown["photo"]["accuracy"] == [0.0001, 5.0]
+
+
 def test_the_page_gets_a_photo_in_two_lines(service, photo, expected):
     name = "über dem <Haus> & Tom's 😀.jpg"
     status, headers, body = service.post("/show", name, photo)
@@ -154,6 +167,11 @@ BROKEN = {
         lambda c, p: c.post("/localize", "a.jpg", p, {"photo": {"camera": "/etc/passwd"}}),
     ),
     "bad value": (400, "fov_deg", lambda c, p: c.post("/localize", "a.jpg", p, {"photo": {"fov_deg": -1}})),
+    "no accuracy": (
+        400,
+        "wanted metres above 0",
+        lambda c, p: c.post("/localize", "a.jpg", p, {"accuracy": {"metres": -1}}),
+    ),
     "bad type": (400, "near", lambda c, p: c.post("/localize", "a.jpg", p, {"prior": {"near": "here"}})),
     "one name": (
         400,
@@ -225,6 +243,7 @@ def test_nothing_but_the_page_can_be_read(service):
 def test_the_description_has_the_options_of_photos_and_priors():
     schemas = describe_service()["components"]["schemas"]
     found = {name: schemas[name]["properties"] for name in ("PhotoOptions", "PriorOptions")}
+    assert schemas["AccuracyOptions"]["properties"].keys() == {"metres", "degrees"}
     for kind, left_out in ((Photo, {"picture", "mask", "rig"}), (Prior, set())):
         properties = found[f"{kind.__name__}Options"]
         assert properties.keys() == {f.name for f in fields(kind)} - left_out

@@ -32,6 +32,7 @@ from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import Panorama
 from piccolo.photo import Prior
 from piccolo.problem.method import METHOD
+from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.zbuffer import visible_points
 from research.synthetic.world import scan_world
@@ -148,7 +149,7 @@ def test_a_copy_of_its_place_that_is_likelier_becomes_the_best(is_copy):
     off = Pose(R, here.center_world + APART + np.array([0.15, 0.1, 0.0]))
     found = make_selection(examine(problem, off), examine(problem, here))
     means = rooms.means()
-    judged = judge(Found(problem, found, None), means, 0.9)
+    judged = judge(Found(problem, found, None), means, CoarseToFineSettings().demand)
     best = problem.scan_map.from_world(judged.best_pose)
     assert best.distance(here if is_copy else off) < 0.1
     assert len(judged.alternatives) == 1

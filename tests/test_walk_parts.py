@@ -16,12 +16,13 @@ from refusals import assert_input_error
 from piccolo.batch.inputs import times_of
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
-from piccolo.geometry.pose_gaussian import PoseGaussian, probability_within
+from piccolo.geometry.pose_gaussian import PoseGaussian
 from piccolo.judge.belief import make_belief
 from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result, nothing_found
 from piccolo.judge.result_parts import Alternative, Evidence
 from piccolo.photo import Photo
+from piccolo.problem.accuracy import PAPER_ACCURACY
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.together.walk.frames import MOST_ODDS, Frame, State, list_states
 from piccolo.together.walk.path import NOTHING, Ranked
@@ -156,7 +157,7 @@ def test_a_frame_of_a_walk_is_believed_by_its_path_and_its_errors(std):
     scan_map = SimpleNamespace(to_world=lambda pose: pose, R_map_from_world=np.eye(3))
     tracker = SimpleNamespace(scan_map=scan_map, settings=CoarseToFineSettings())
     found = make_localization(tracker, Frame(0.0), Ranked(states, np.array([0.92, *[0.01] * 8])))
-    assert found.belief == make_belief([0.92, *[0.01] * 5], probability_within(here))
+    assert found.belief == make_belief([0.92, *[0.01] * 5], PAPER_ACCURACY.probability(here))
     assert found.belief.place[-1] == pytest.approx(0.03)
     assert (found.status == "localized") == (std == 0.01)
     assert len(found.alternatives) == 5

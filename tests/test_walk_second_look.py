@@ -9,6 +9,7 @@ from key_frames import make_followed
 from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import no_progress
 from piccolo.judge.result import Result
+from piccolo.problem.accuracy import PAPER_ACCURACY
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.together.walk import path as walk_path, second_look
 from piccolo.together.walk.frames import Frame, Motion, State
@@ -114,12 +115,13 @@ def test_rough_places_are_refined_if_they_leave_another_unsure(probabilities, is
 
 def test_frames_that_are_not_sure_are_searched_some_of_each_run():
     sure, unsure = Ranked([State(_at(0.0), 8.0, 0.5)], np.array([0.99])), NOTHING
+    demand = CoarseToFineSettings().demand
     frames = [Frame(float(k)) for k in range(60)]
     beliefs = [unsure] * 2 + [sure] + [unsure] * 57
-    assert second_look.list_unsure(frames, beliefs, 0.9) == [0, 1, *range(5, 60, 5)]
+    assert second_look.list_unsure(frames, beliefs, demand) == [0, 1, *range(5, 60, 5)]
     frames[1].alone = Result()
-    assert second_look.list_unsure(frames, beliefs, 0.9)[:2] == [0, 5]
-    assert second_look.list_unsure(frames[:3], [sure] * 3, 0.999) == [0, 2]
+    assert second_look.list_unsure(frames, beliefs, demand)[:2] == [0, 5]
+    assert second_look.list_unsure(frames[:3], [sure] * 3, demand._replace(min_confidence=0.999)) == [0, 2]
 
 
 @pytest.mark.parametrize(
@@ -155,7 +157,7 @@ def test_a_pose_that_found_a_frame_before_stays_if_it_is_likelier(walk, monkeypa
     tracker, path, beliefs = walk
     tracker.frames[LOST] = make_followed(TIMES[LOST], 1, (10, 0, 0), 2.0)
     beliefs[LOST] = believe(tracker.frames, path, LOST)
-    assert 0.8 < beliefs[LOST].confidence < 0.9
+    assert 0.8 < beliefs[LOST].confidence(PAPER_ACCURACY) < 0.9
     before = tracker.frames[LOST]
 
     def find_worse(problem, frame, near):

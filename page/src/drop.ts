@@ -17,7 +17,7 @@ const TRIES = 6; // of a photo that a busy service sends away
 const FOV = "65"; // degrees, of most phones
 const NARROW = "(max-width: 860px)";
 const ENDING = /\.[A-Za-z0-9]{3,4}( \(\d+\))?$/;
-const NONE = ["probabilityNone", "scan", "captured", "size", "walk", "time", "pose", "storey", "height", "evidence", "spread"];
+const NONE = ["probabilityNone", "accuracy", "hint", "scan", "captured", "size", "walk", "time", "pose", "storey", "height", "evidence", "spread"];
 const words = text.drop;
 
 /** A photo that was dropped; it rests while a busy service is left alone. */
@@ -153,7 +153,7 @@ export class Drop {
     for (let k = 2; isTaken(name); k++) name = `${file.name} (${k})`;
     return {
       ...(Object.fromEntries(NONE.map((key) => [key, null])) as unknown as Photo),
-      ...{ gap: false, isOnPlan: false, hasPictures: false, confidence: 0, warnings: [], contradicts: [], alternatives: [] },
+      ...{ gap: false, isOnPlan: false, hasPictures: false, confidence: 0, placeProbability: 0, warnings: [], contradicts: [], alternatives: [] },
       ...{ name, short: name.replace(ENDING, "$1"), key: `dropped-${this.count++}` },
       ...{ status: "waiting", error: words.queued, thumb },
     };

@@ -6,6 +6,8 @@ import type { Model } from "./model";
 import { plain, text } from "./text";
 import type { Photo, Pose } from "./types";
 
+const PAPER: [number, number] = [0.1, 5]; // m and degrees, where a result does not say them
+
 /** Put a text on the clipboard, also where a page on disk may not ask the browser to. */
 async function copy(words: string): Promise<void> {
   try {
@@ -34,6 +36,10 @@ export function doingButton(name: string, label: string, done: string, act: () =
 export function copyButton(name: string, label: string, words: () => string): HTMLElement {
   return doingButton(name, label, text.copied, () => copy(words()));
 }
+
+/** A probability in a line. */
+const probability = (label: string, value: number, help: string): HTMLElement =>
+  h("div", { class: "confidence", title: help }, h("span", {}, label), h("b", {}, percent(value)));
 
 export class Facts {
   constructor(
@@ -80,10 +86,10 @@ export class Facts {
       h("p", { class: `verdict ${photo.status}` }, badge(photo.status), verdictOf(photo)),
       h("p", { class: "meaning" }, this.meaning(photo)),
       ...photo.contradicts.map((told) => h("p", {}, text.contradictions[told])),
-      hasConfidence
-        ? h("div", { class: "confidence", title: text.confidenceHelp }, h("span", {}, text.confidence), h("b", {}, percent(photo.confidence)))
-        : null,
+      photo.hint ? h("p", {}, plain(photo.hint)) : null,
+      hasConfidence ? probability(text.confidence, photo.confidence, text.confidenceHelp(photo.accuracy ?? PAPER)) : null,
       hasConfidence ? meter : null,
+      hasConfidence ? probability(text.place, photo.placeProbability, text.placeHelp) : null,
     );
   }
 

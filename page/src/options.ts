@@ -1,4 +1,4 @@
-/** A dialog that asks what a photo's file does not say: its field of view, and about where it was taken. */
+/** A dialog that asks what a photo's file does not say: its field of view, about where it was taken, and how exact a pose must be. */
 import { h, iconButton } from "./dom";
 import type { Plan } from "./plan";
 import { text } from "./text";
@@ -30,6 +30,7 @@ export class OptionsDialog {
       field("x", null, null),
       field("y", null, null),
       field("radius", 0.1, 1e4),
+      field("accuracy", 0.001, 1e4),
       h("button", { type: "button", class: "copy", onclick: () => this.pick() }, words.pick),
       h("button", { class: "copy main", onclick: () => this.check() }, words.use),
     );

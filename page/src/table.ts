@@ -2,14 +2,14 @@
 import { h } from "./dom";
 import type { Model } from "./model";
 
-const COLUMNS = ["photo", "status", "confidence", "storey", "x", "y", "z", "heading_deg", "pitch_deg", "roll_deg", "std_mm"];
+const COLUMNS = ["photo", "status", "confidence", "place_probability", "storey", "x", "y", "z", "heading_deg", "pitch_deg", "roll_deg", "std_mm"];
 
 /** Save the photos listed as CSV. */
 export function download({ listed, report }: Model): void {
   const rows = listed.map((index) => {
-    const { name, status, confidence, storey, pose, spread } = report.photos[index];
+    const { name, status, confidence, placeProbability, storey, pose, spread } = report.photos[index];
     const where = pose ? [...pose.world, ...pose.angles] : Array<string>(6).fill("");
-    return [name, status, confidence, storey === null ? "" : report.storeys[storey].name, ...where, spread?.largest ?? ""];
+    return [name, status, confidence, placeProbability, storey === null ? "" : report.storeys[storey].name, ...where, spread?.largest ?? ""];
   });
   saveTable(report.title, COLUMNS, rows);
 }

@@ -28,6 +28,7 @@ const PARAMETERS: Record<string, string> = {
 export const plain = (words: string): string =>
   words
     .replace(/`projection` pinhole `fov_deg` (\d+) `refine_focal`/, "a field of view of about $1°")
+    .replace(/`accuracy` ([\d.]+)(?: ([\d.]+))?/, (_, metres: string, degrees?: string) => `an accuracy of ${metres} m${degrees ? ` and ${degrees}°` : ""}`)
     .replace(/`(\w+)`/g, (_, name: string) => PARAMETERS[name] ?? name);
 
 export const text = {
@@ -131,7 +132,9 @@ export const text = {
   neighbor: (name: string, metres: string) => `Go to ${name}, ${metres} m away`,
   details: "Facts",
   confidence: "Confidence",
-  confidenceHelp: "Probability that the pose is within 0.1 m and 5°",
+  confidenceHelp: ([metres, degrees]: [number, number]) => `Probability that the pose is within ${metres} m and ${degrees}°`,
+  place: "Place",
+  placeHelp: "Probability that the place is right, however exact the pose is",
   position: "Position",
   angles: "Heading, pitch, roll",
   height: "Above the floor",
@@ -249,13 +252,14 @@ export const text = {
     again: "Try again",
     remove: "Take off the list",
     options: "Options",
-    optionsLead: "Tell what you know; leave the rest empty. The field of view is for photos that are not 360°.",
+    optionsLead: "Tell what you know or need; leave the rest empty. The field of view is for photos that are not 360°.",
     fields: {
       fov: "Horizontal field of view, about [°]",
       focal: "or focal length [pixels]",
       x: "Taken near x [m]",
       y: "y [m]",
       radius: "within [m]",
+      accuracy: "Exact enough is [m]",
     } as Record<string, string>,
     pick: "Show the place on the plan",
     picking: "Click on the plan where it was taken; Escape gives up",

@@ -53,6 +53,11 @@ export interface Photo {
   key: string;
   status: Status;
   confidence: number;
+  /** That its place is right, however exact it is. */
+  placeProbability: number;
+  /** Metres and degrees that the confidence is of; null where it is not known. */
+  accuracy: [number, number] | null;
+  hint: string | null;
   probabilityNone: number | null;
   error: string | null;
   warnings: string[];

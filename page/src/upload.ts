@@ -95,10 +95,11 @@ function parsed(line: string) {
 }
 
 /** Options as the service reads them: those of the lens are for photos that are not spheres, and a field is known about. */
-export function asJson({ fov, focal, x, y, radius }: Options, isSphere: boolean): object {
+export function asJson({ fov, focal, x, y, radius, accuracy }: Options, isSphere: boolean): object {
   const lens = focal ? { focal_px: Number(focal) } : { fov_deg: Number(fov), refine_focal: true };
   return {
     photo: (fov || focal) && !isSphere ? { ...lens, projection: "pinhole" } : undefined,
     prior: x && y ? { near: [Number(x), Number(y), null], radius: Number(radius) || RADIUS } : undefined,
+    accuracy: accuracy ? { metres: Number(accuracy) } : undefined,
   };
 }

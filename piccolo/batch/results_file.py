@@ -15,7 +15,7 @@ from ..together.second_looks import may_change
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
 WAYS = "use `overwrite` to start again, or another `out`"
 GROUPS = ("prior", "cloud", "panorama")  # of settings, each of which an option sets
-OPTIONS = ("preset", "gravity", "min_confidence")  # of the other settings those that are options
+OPTIONS = ("preset", "gravity", "accuracy", "min_confidence")  # of the other settings those that are options
 RENAMED = {"scale": "units"}
 Name = TypeVar("Name", Path, str)
 
@@ -58,6 +58,8 @@ def describe_changes(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str
 def _by_option(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the value of each setting by the name of its option in backticks, or by its own."""
     values = {name: settings[name] for name in settings if name not in (*GROUPS, "method")}
+    if "accuracy" in values:
+        values["accuracy"] = list(values["accuracy"].values())
     values |= settings.get("method", {})  # whose numbers no option sets
     values = {f"`{name}`" if name in OPTIONS else name: value for name, value in values.items()}
     grouped = {name: value for group in GROUPS for name, value in settings.get(group, {}).items()}

@@ -45,12 +45,18 @@ def advise(result: Result) -> list[str]:
     is_ruled_out = result.best_pose is None or result.belief.ruled_out
     if result.status == LOCALIZED or is_ruled_out or result.settings.get("preset") == "paper":
         return []
+    if result.hint:
+        return [f"  {for_terminal(result.hint)}"]
     focal = result.focal_length
-    if result.confidence >= WORTH_A_LOOK and focal is not None and focal.given_std_px > WIDE * focal.given_px:
+    if (
+        result.place_probability >= WORTH_A_LOOK
+        and focal is not None
+        and focal.given_std_px > WIDE * focal.given_px
+    ):
         return ["  if other photos of this camera are localized, repeat with --focal, the mean of theirs"]
     if result.status == AMBIGUOUS:
         return ["  to decide, give --near or --heading, or localize several photos of a walk (--walk)"]
-    if result.confidence >= WORTH_A_LOOK:
+    if result.place_probability >= WORTH_A_LOOK:
         others = "add photos taken beside it" if result.cameras else "localize photos of a walk (--walk)"
         return [f"  to be sure, look at the --overlay, give --near, or {others}"]
     lens = ", a wrong focal length" if result.cameras else ""

@@ -134,6 +134,10 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     text = "known: the camera was upright and z of the cloud is up; unknown: any rotation; auto: try both "
     text += "(default auto)"
     group.add_argument("--gravity", choices=["auto", "known", "unknown"], help=text)
+    text = "how exact a pose must be, in position and rotation: confidence is the probability that it is "
+    group.add_argument(
+        "--accuracy", nargs="+", type=float, metavar=("METRES", "DEGREES"), help=f"{text}(default 0.1 5)"
+    )
     text = f"confidence from which a pose is localized (default {MIN_CONFIDENCE})"
     option(group, "--min-confidence X", text)
 

@@ -12,6 +12,7 @@ from ..panorama import check_labels
 from ..paper.localize import PaperSettings
 from ..photo import NOTHING_KNOWN, Photo, Prior
 from ..photo_reader import Settings
+from ..problem.accuracy import Accuracy
 from ..problem.settings import CoarseToFineSettings
 from ..scan import ONLY_DEFAULT
 from ..scan_map.open_map import CachePolicy
@@ -58,6 +59,7 @@ def settings_from(arguments: Arguments) -> Settings:
     given = parse_settings(name, words)
     asked = {"gravity": arguments.gravity, "min_confidence": arguments.min_confidence}
     given |= {name: value for name, value in asked.items() if value is not None}
+    accuracy = accuracy_from(arguments.accuracy)
     options = vars(arguments)
     prior = prior_from(options)
     if name == "paper":
@@ -65,11 +67,22 @@ def settings_from(arguments: Arguments) -> Settings:
         foreign = [option for option in told if option != "use_gps"]
         foreign += [option for option in ONLY_DEFAULT if options.get(option)]
         foreign += ["up"] if arguments.up != "auto" else []
+        foreign += ["accuracy"] if accuracy else []
         if foreign:
             raise InputError(f"`{foreign[0]}`: not an option of the preset paper")
     else:
         given["prior"] = prior
+        given |= {"accuracy": accuracy} if accuracy else {}
     return PRESETS[name](**given)
+
+
+def accuracy_from(numbers: Sequence[float] | None) -> Accuracy | None:
+    """Return the accuracy that one or two numbers ask for; None of none."""
+    if numbers is None:
+        return None
+    if len(numbers) > len(fields(Accuracy)):
+        raise InputError(f"`accuracy`: found {len(numbers)} numbers, wanted METRES or METRES DEGREES")
+    return Accuracy(*numbers)
 
 
 def prior_from(options: dict[str, Any]) -> Prior:
@@ -87,7 +100,11 @@ def prior_from(options: dict[str, Any]) -> Prior:
 
 def parse_settings(preset: str, words: Sequence[str]) -> dict[str, Any]:
     """Return the settings of a preset that are written as NAME=VALUE."""
-    hints = {name: hint for name, hint in get_type_hints(PRESETS[preset]).items() if name != "prior"}
+    hints = {
+        name: hint
+        for name, hint in get_type_hints(PRESETS[preset]).items()
+        if name not in ("prior", "accuracy")
+    }
     given: dict[str, Any] = {}
     for word in words:
         name, _, text = word.partition("=")

@@ -19,7 +19,7 @@ from ..camera import Camera
 from ..camera.corrections import FOCAL, LENS, Corrections
 from ..camera.model import MODELS, RADIAL
 from ..geometry.pose import Pose, rotate_points
-from ..geometry.pose_gaussian import PoseGaussian, add, probability_within
+from ..geometry.pose_gaussian import PoseGaussian, add
 from ..geometry.sphere import compute_indices
 from ..jobs.threads import Workers
 from ..judge.candidate import Candidate
@@ -29,6 +29,7 @@ from ..judge.result_parts import FocalLength
 from ..local_features.matching import NO_MATCHES, Matches
 from ..panorama import Panorama
 from ..panorama.model import FocalPrior
+from ..problem.accuracy import Accuracy
 from ..problem.problem import Problem
 from ..problem.stages import Limits
 from ..views.view import Cells
@@ -123,14 +124,16 @@ class FocalFit(NamedTuple):
         return replace(found, doubt=self.doubt, picture_px=px, picture_std_px=std)
 
 
-def doubt_unconfirmed(fit: FocalFit, gaussian: PoseGaussian | None) -> FocalFit:
+def doubt_unconfirmed(fit: FocalFit, gaussian: PoseGaussian | None, accuracy: Accuracy) -> FocalFit:
     """Return the fit of a photo by itself, doubted more where the photo does not confirm what was given.
 
-    If what was given says nothing, the pose is only as exact as by the photo's own focal length.
+    If what was given says nothing, the position is only as exact as by the photo's own focal length, which
+    may be less than is wanted.
     """
     if fit.of_picture is None or gaussian is None:
         return fit
-    missed = 1.0 - probability_within(gaussian.widen(fit.of_picture))
+    of_position, _ = accuracy.parts(gaussian.widen(fit.of_picture).covariance)
+    missed = 1.0 - of_position
     return fit._replace(doubt=1.0 - (1.0 - fit.doubt) * (1.0 - UNCONFIRMED * missed))
 
 

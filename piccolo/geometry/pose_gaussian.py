@@ -11,11 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..arrays import Array, Floats
-from .pose import MAX_DISTANCE, Pose, exp_so3, log_so3, orthonormal, rotate_points, skew
+from .nearness import Nearness
+from .pose import Pose, exp_so3, log_so3, orthonormal, rotate_points, skew
 
 LIKELY = 12.6  # chi square of 6 at 95 %: poses that differ by more contradict each other
-LEAST_VARIANCE = 1e-18  # [m^2]
+LEAST_VARIANCE = 1e-18  # [m^2], [rad^2]
 MOST_DEVIATIONS = 8.0  # deviations that an integral goes to
+SURE_DEVIATIONS = 4.0  # chosen: a rotation is within them with 0.9989; no covariance is that sure of more
 NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(64)
 COSINES = np.cos((np.arange(32) + 0.5) * math.pi / 32.0)  # of directions in half a turn
 LOOSE = 1e-6  # [1/rad^2, 1/m^2] information that makes matrices invertible
@@ -95,11 +97,6 @@ def largest_std(covariance: Array) -> float:
     return math.sqrt(max(float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]), 0.0))
 
 
-def probability_within(found: PoseGaussian | None) -> float:
-    """Return the probability that a position is within MAX_DISTANCE of that of a pose; 1 for None."""
-    return 1.0 if found is None else probability_of_ball(found.covariance[3:, 3:], MAX_DISTANCE)
-
-
 def probability_of_ball(covariance: Array, radius: float) -> float:
     """Return the probability that an error (3,) of mean zero with a covariance (3, 3) is within a radius [m].
 
@@ -117,14 +114,40 @@ def probability_of_ball(covariance: Array, radius: float) -> float:
     return min(float(reach * NODE_WEIGHTS @ (density * inside)), 1.0)
 
 
-def probability_near(offset: Array, covariance: Array) -> float:
-    """Return the probability that a position is within MAX_DISTANCE of a place at an offset (3,) from it.
+def probability_of_turn(covariance: Array, angle: float) -> float:
+    """Return the probability that a rotation's error (3,) with a covariance (3, 3) is within an angle [rad].
 
-    Along the offset and across it the covariance (3, 3) counts by its largest deviation.
+    A small rotation is a vector as an error of the position is. 1 if it surely is within.
     """
-    std = math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 1e-18)) * math.sqrt(2.0)
+    return 1.0 if _is_sure_turn(covariance, angle) else probability_of_ball(covariance, angle)
+
+
+def probability_near(pose: Pose, expected: PoseGaussian, near: Nearness) -> float:
+    """Return the probability that a pose is near the true one, if that is as expected.
+
+    Along an offset and across it the covariance counts by its largest deviation.
+    """
+    step = subtract(pose, expected.pose)
+    covariance = expected.covariance
+    of_position = _probability_at(step[3:], covariance[3:, 3:], near.distance)
+    turn = step[:3]
+    of_turn = covariance[:3, :3]
+    if _is_sure_turn(of_turn, near.angle - float(np.linalg.norm(turn))):
+        return of_position
+    return of_position * _probability_at(turn, of_turn, near.angle)
+
+
+def _is_sure_turn(covariance: Array, angle: float) -> bool:
+    """Return True if a rotation's error is within an angle [rad] but for SURE_DEVIATIONS."""
+    std = math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), LEAST_VARIANCE))
+    return angle >= SURE_DEVIATIONS * std
+
+
+def _probability_at(offset: Array, covariance: Array, limit: float) -> float:
+    """Return the probability that an error (3,) is within a limit of an offset (3,)."""
+    std = math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), LEAST_VARIANCE)) * math.sqrt(2.0)
     gap = float(np.linalg.norm(offset))
-    return 0.5 * (math.erf((MAX_DISTANCE - gap) / std) + math.erf((MAX_DISTANCE + gap) / std))
+    return 0.5 * (math.erf((limit - gap) / std) + math.erf((limit + gap) / std))
 
 
 def square_root(covariance: Array) -> Array:

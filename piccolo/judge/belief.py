@@ -1,6 +1,6 @@
 """The belief in a photo's poses, and the status that follows from it.
 
-Three questions have answers of their own: which place is right, whether the pose is within 0.1 m there, and
+Three questions have answers of their own: which place is right, whether the pose is exact enough there, and
 whether what was given, as a focal length, holds. Only `Belief.probabilities` multiplies them.
 """
 
@@ -20,7 +20,7 @@ class Belief:
     """Probabilities of a photo's poses, the best one first."""
 
     place: tuple[float, ...]  # (K + 1,) that the place of each of K poses is right, and that none of them is
-    within: float = 1.0  # that the best pose is within 0.1 m if its place is right
+    within: float = 1.0  # that the best pose is as exact as wanted if its place is right
     doubt: float = 0.0  # that what was given of the photo's geometry is wrong
     ruled_out: frozenset[Reason] = frozenset()  # why no pose is right, whatever others say
 
@@ -32,7 +32,7 @@ class Belief:
 
     @property
     def probabilities(self) -> Array:
-        """Probabilities (K + 1,) that each pose is right, within 0.1 m, and that none of them is."""
+        """Probabilities (K + 1,) that each pose is right, as exact as wanted, and that none of them is."""
         return _complete(self.within * self.sound_places[:-1])
 
     def scale(self, factor: float) -> "Belief":

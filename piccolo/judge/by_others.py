@@ -44,7 +44,7 @@ def believe_together(
     """Return the belief in a photo's poses in a bundle, of which the first is believed.
 
     `bundles` (K + 1,) are the probabilities of K poses of the bundle, and of none. How likely the pose is
-    within 0.1 m is `within_own` if the photo's own pose is right, else `within_others`, by the pose that the
+    exact enough is `within_own` if the photo's own pose is right, else `within_others`, by the pose that the
     others expect. `alone` is the belief of a photo that is sure by itself: that others show nothing says
     nothing against it.
     """

@@ -16,12 +16,14 @@ from ..geometry.pose import Pose, check_pose, heading_pitch_roll_deg
 from ..geometry.pose_gaussian import PoseGaussian
 from ..geometry.sphere import CONVENTION
 from ..photo import GpsPrior
+from ..problem.accuracy import Accuracy, Demand
+from .accuracy_hint import explain_accuracy
 from .belief import NOTHING, Belief, decide
 from .pose_covariance import PoseCovariance
 from .probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED, Standing
 from .result_parts import Alternative, Beside, Evidence, FocalLength, Source, SphereGeometry, WalkFrame
 
-FORMAT = "piccolo-pose/12"
+FORMAT = "piccolo-pose/13"
 POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")
 UNREADABLE = "unreadable"
 FAILED = "failed"
@@ -50,7 +52,11 @@ class Result:
     best_pose
         `pose` or `best_guess`, whichever there is.
     confidence
-        Probability that `best_pose` is within 0.1 m and 5 degrees.
+        Probability that `best_pose` is as exact as `settings` say, by default within 0.1 m and 5 degrees.
+    place_probability
+        Probability that its place is right, however exact it is.
+    hint
+        Which accuracy would accept a pose whose place is certain, one line; else None.
     probability_none
         Probability that neither `best_pose` nor an alternative is right; None if the photo was not read.
     belief
@@ -163,6 +169,21 @@ class Result:
         return np.zeros((6, 6)) if self.covariance is None else self.covariance.matrix
 
     @property
+    def place_probability(self) -> float:
+        """Probability that the place of `best_pose` is right, however exact it is; 0 without a pose."""
+        is_believed = len(self.belief.place) > 1
+        return float(self.belief.sound_places[0]) if is_believed else 0.0
+
+    @property
+    def hint(self) -> str | None:
+        """Which accuracy would accept a pose whose place is certain, on one line; None for all else."""
+        asked = self.settings.get("accuracy")
+        if self.status == LOCALIZED or self.covariance is None or not asked:
+            return None
+        demand = Demand(Accuracy(**asked), self.settings["min_confidence"])
+        return explain_accuracy(self.place_probability, self.covariance, demand)
+
+    @property
     def cloud_name(self) -> str:
         """Path of the scan, or paths of its files, separated by commas."""
         return self.cloud if isinstance(self.cloud, str) else ", ".join(self.cloud)
@@ -235,6 +256,7 @@ class Result:
             rows["pose" if self.pose else "best guess"] = f"({x:.3f}, {y:.3f}, {z:.3f}) m, {turned}"
         if self.covariance is not None:
             rows["one sigma"] = f"{1000.0 * self.covariance.largest_std:.1f} mm"
+        rows |= {"hint": self.hint} if self.hint else {}
         rows |= {"warnings": "; ".join(self.warnings)} if self.warnings else {}
         rows |= {"error": self.error} if self.error else {}
         cells = (f"<tr><th>{name}</th><td>{escape(printable(text))}</td></tr>" for name, text in rows.items())
@@ -248,6 +270,8 @@ class Result:
             "format": FORMAT,
             "status": self.status,
             "confidence": self.confidence,
+            "place_probability": self.place_probability,
+            "hint": self.hint,
             "probability_none": self.probability_none,
             "calibrated": self.is_calibrated,
             "belief": _belief_json(self.belief) if self.is_believed else None,

@@ -11,7 +11,7 @@ from ..evidence.contradictions import contradictions
 from ..evidence.examine import complete
 from ..evidence.focal_length import FocalFit, doubt_unconfirmed, fit_focal
 from ..evidence.measuring import Fit, describe_geometry, measure
-from ..geometry.pose_gaussian import PoseGaussian, probability_within
+from ..geometry.pose_gaussian import PoseGaussian
 from ..jobs.threads import Workers
 from ..judge.belief import Belief, make_belief
 from ..judge.candidate import Candidate, Selection
@@ -20,6 +20,7 @@ from ..judge.conclude import conclude
 from ..judge.probability import posterior
 from ..judge.result import Result, nothing_found
 from ..judge.selection import assess, credit_copies, is_mirrored
+from ..problem.accuracy import Demand
 from ..problem.problem import Problem
 from .copies import list_reported
 from .ladder import settle
@@ -39,7 +40,7 @@ class Found(NamedTuple):
         return Found(self.problem.forget(), self.selection.forget(), self.fit)
 
 
-def judge(found: Found, means: Means, min_confidence: float, may_promote: bool = True) -> Result:
+def judge(found: Found, means: Means, demand: Demand, may_promote: bool = True) -> Result:
     """Return the result for the best pose of a photo by itself.
 
     If `may_promote`, a copy of the best pose's place that turns out likelier becomes the best.
@@ -55,14 +56,14 @@ def judge(found: Found, means: Means, min_confidence: float, may_promote: bool =
     likeliest = int(places.argmax())
     if likeliest and is_copy[likeliest] and may_promote:
         other = promote(problem, selection, reported.candidates[likeliest], fit, workers)
-        return judge(other, means, min_confidence, may_promote=False)
-    belief = make_belief(places, probability_within(measured.errors.gaussian))
+        return judge(other, means, demand, may_promote=False)
+    belief = make_belief(places, demand.accuracy.probability(measured.errors.gaussian))
     if isinstance(fit, FocalFit):
-        fit = doubt_unconfirmed(fit, measured.errors.gaussian)
+        fit = doubt_unconfirmed(fit, measured.errors.gaussian, demand.accuracy)
         if fit.of_difference is not None:
             measured = measured._replace(errors=measured.errors.widen(fit.of_difference))
     case = Case(reported, tuple(standings), measured, fit and describe_geometry(problem, fit))
-    return decide_case(problem, case, belief, means, min_confidence)
+    return decide_case(problem, case, belief, means, demand.min_confidence)
 
 
 def promote(
@@ -111,7 +112,7 @@ def decide_case(problem: Problem, case: Case, belief: Belief, means: Means, min_
     if case.geometry is not None:  # no pose is surer than what it rests on
         belief = replace(belief, doubt=case.geometry.doubt)
     best = case.found.best
-    if belief.probabilities[-1] < 1.0 - problem.method.worth_asking:
+    if belief.sound_places[-1] < 1.0 - problem.method.worth_asking:
         mirrored = find_mirrored(problem, best, means.effort, means.workers)
         case = case._replace(is_mirrored=is_mirrored(problem.method, best, mirrored))
     found = conclude(problem.scan_map, case, belief, min_confidence)

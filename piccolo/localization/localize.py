@@ -49,7 +49,7 @@ def localize(scan_map: ScanMap, panorama: Panorama, settings: CoarseToFineSettin
     search = find_by_edges if problem.profile.follows_walls else find
     found = search(problem, scan_map, means)
     with means.watch.stage("refine"):
-        return judge(found, means, settings.min_confidence)
+        return judge(found, means, settings.demand)
 
 
 def prepare_search(

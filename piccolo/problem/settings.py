@@ -7,6 +7,7 @@ from ..arguments import MIN_CONFIDENCE, check_confidence, check_fields
 from ..errors import InputError
 from ..geometry.pose import Gravity
 from ..photo import NOTHING_KNOWN, Prior
+from .accuracy import PAPER_ACCURACY, Accuracy, Demand
 from .method import METHOD, Method
 
 # at most: a minute and a gigabyte for a flat, far beyond what finds more
@@ -36,6 +37,7 @@ class CoarseToFineSettings:
     num_yaws: int = 48  # gravity known
     num_rotations: int = 2000  # of SO(3), gravity unknown
     max_starts: int = 4000  # poses from which a descent begins
+    accuracy: Accuracy = PAPER_ACCURACY  # how exact a pose must be
     min_confidence: float = MIN_CONFIDENCE  # below it a pose is not called localized
     method: Method = METHOD  # for research: the numbers by which the method decides
 
@@ -51,6 +53,11 @@ class CoarseToFineSettings:
     def effort(self) -> Effort:
         """The numbers of rotations and starts of a search."""
         return Effort(self.num_yaws, self.num_rotations, self.max_starts, self.method.first_starts)
+
+    @property
+    def demand(self) -> Demand:
+        """Demands on a pose that is called localized."""
+        return Demand(self.accuracy, self.min_confidence)
 
     def to_json(self) -> dict[str, object]:
         """Return the settings as they took effect."""

@@ -98,13 +98,17 @@ def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> d
     """Return what the page knows of a result before it is opened; angles in degrees, lengths in metres."""
     result = entry.result
     contradicts = list_contradicted(result)
-    is_unlikely = result.status == NOT_LOCALIZED and result.confidence < SHOWN
+    accuracy = result.settings.get("accuracy")
+    is_unlikely = result.status == NOT_LOCALIZED and result.place_probability < SHOWN
     is_hopeless = is_unlikely and not contradicts
     return {
         "name": name,
         "key": key,
         "status": UNREADABLE if result.status == FAILED else result.status,  # the page has no word for it
         "confidence": round(result.confidence, 5),
+        "placeProbability": round(result.place_probability, 5),
+        "accuracy": list(accuracy.values()) if accuracy else None,
+        "hint": result.hint,
         "probabilityNone": _round(result.probability_none, 5),
         "error": result.error and _below(result.error, result.pano, name),
         "warnings": [_below(warning, result.pano, name) for warning in result.warnings],

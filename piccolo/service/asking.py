@@ -14,12 +14,14 @@ from ..camera.calibration import calibration_of
 from ..errors import UNPRINTABLE, InputError, printable
 from ..files.json_file import DAMAGE
 from ..photo import Photo, Prior
+from ..problem.accuracy import Accuracy
 from ..problem.settings import CoarseToFineSettings
 
-PARTS = ("photo", "prior", "gravity", "min_confidence", "together")
+PARTS = ("photo", "prior", "gravity", "accuracy", "min_confidence", "together")
 # options of a photo that name no file
 PHOTO = {f.name for f in fields(Photo)} - {"picture", "mask", "rig"}
 PRIOR = {f.name for f in fields(Prior)}
+ACCURACY = {f.name for f in fields(Accuracy)}
 PLACES: dict[str, Collection[str]] = {"options": PARTS, "options.photo": PHOTO, "options.prior": PRIOR}
 # bytes of a photo's name that are kept; a file's name has up to 255, with what is put before it
 MAX_NAME = 240
@@ -105,8 +107,10 @@ def are_together(options: Mapping[str, Any]) -> bool:
 def apply_options(settings: CoarseToFineSettings, options: Mapping[str, Any]) -> CoarseToFineSettings:
     """Return the settings of a photo: those of the service, with the request's own in their place."""
     given = check_object(options.get("prior", {}), PRIOR, "options.prior")
+    wanted = check_object(options.get("accuracy", {}), ACCURACY, "options.accuracy")
     changed = {name: options[name] for name in ("gravity", "min_confidence") if name in options}
     try:
-        return replace(settings, prior=replace(settings.prior, **given), **changed)
+        prior = replace(settings.prior, **given)
+        return replace(settings, prior=prior, accuracy=replace(settings.accuracy, **wanted), **changed)
     except DAMAGE as error:
         raise InputError(f"options: {error}") from error

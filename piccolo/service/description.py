@@ -1,4 +1,4 @@
-"""The OpenAPI description of the service; the options in it are those of `Photo` and `Prior`."""
+"""The OpenAPI description of the service; the options in it are those of `Photo`, `Prior` and `Accuracy`."""
 
 import inspect
 import json
@@ -11,7 +11,8 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from .. import __version__
 from ..camera import Calibration
 from ..photo import Photo, Prior
-from .asking import PHOTO, PRIOR
+from ..problem.accuracy import Accuracy
+from .asking import ACCURACY, PHOTO, PRIOR
 
 NAMES = {float: "number", int: "integer", bool: "boolean", str: "string"}
 PARAMETERS = re.compile(r"^Parameters\n-+\n(.*?)\n\n", re.DOTALL | re.MULTILINE)
@@ -28,6 +29,7 @@ def describe_service() -> dict[str, Any]:
     schemas["PhotoOptions"] = describe_options(Photo, PHOTO)
     schemas["PhotoOptions"]["properties"]["camera"]["description"] = CAMERA
     schemas["PriorOptions"] = describe_options(Prior, PRIOR)
+    schemas["AccuracyOptions"] = describe_options(Accuracy, ACCURACY)
     return document
 
 

@@ -16,7 +16,7 @@ from ..evidence.focal_length import FocalFit
 from ..evidence.verification import Located, match_beside, match_covariance, place_keypoints
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
-from ..geometry.pose_gaussian import PoseGaussian, probability_within, turn_positions
+from ..geometry.pose_gaussian import PoseGaussian, turn_positions
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.by_others import believe_beside
 from ..judge.conclude import take_pose
@@ -105,14 +105,14 @@ def localize_beside(
         ended = fit_camera(problem, refine_best(problem, candidates, workers), means)
         if isinstance(ended.fit, FocalFit):  # the photo beside confirms the pose
             ended = ended._replace(fit=ended.fit._replace(of_picture=None))
-        judged = judge(ended, means, settings.min_confidence)
+        judged = judge(ended, means, settings.demand)
         kept = list_agreeing(ended.problem.method, judged, found, ended.problem.beside, scan_map)
         if not kept:
             return nothing_found(), ()
         within = None
         fused = fuse(judged, kept[0], ended)
         if fused is not None:
-            within = probability_within(fused)
+            within = settings.accuracy.probability(fused)
             judged = take_pose(judged, fused, scan_map)
         belief = believe_beside(judged.belief, [other.picture.confidence for other in kept], within)
     return judged.take_belief(belief, settings.min_confidence), tuple(other.name for other in kept)

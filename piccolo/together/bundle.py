@@ -18,7 +18,7 @@ from ..arrays import Array
 from ..evidence.examine import complete, examine
 from ..evidence.focal_length import FocalFit
 from ..geometry.pose import Pose
-from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_within, subtract
+from ..geometry.pose_gaussian import PoseGaussian, subtract
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.by_others import LOCAL_ERRORS, Shares, believe_together
 from ..judge.candidate import Selection
@@ -29,6 +29,7 @@ from ..localization.calibration import calibrate
 from ..localization.judging import Found, judge_together
 from ..localization.means import NO_TRACE, Means, Trace
 from ..panorama import Panorama
+from ..problem.accuracy import Demand
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
 from .bundle_adjustment import (
@@ -96,12 +97,12 @@ def localize_bundle(
     settings = posed[0].settings
     with watch.stage("refine"):
         means = Means(settings.effort, workers, watch)
-        together = judge_members(members, errors, means, settings.min_confidence)
+        together = judge_members(members, errors, means, settings.demand)
     return [together.get(k, one) for k, one in enumerate(alone)]
 
 
 def judge_members(
-    members: dict[int, PosedMember], errors: RelativeErrors, means: Means, min_confidence: float
+    members: dict[int, PosedMember], errors: RelativeErrors, means: Means, demand: Demand
 ) -> dict[int, Result]:
     """Return the results of photos together, or each by itself with the reason."""
     workers = means.workers
@@ -140,7 +141,7 @@ def judge_members(
     ranked = probabilities[[best, *others, -1]]
     elsewhere = [bundles[i] for i in others]
     judge_one = partial(judge_member, agreed=agreed, elsewhere=elsewhere, probabilities=ranked, means=means)
-    return {k: judge_one(members[k], k, supports[k], min_confidence) for k in members}
+    return {k: judge_one(members[k], k, supports[k], demand) for k in members}
 
 
 def list_neighbors(members: dict[int, PosedMember], k: int) -> list[Pose]:
@@ -233,7 +234,7 @@ class Placement(NamedTuple):
 
     gaussian: PoseGaussian | None  # in the map; None if neither the photo nor others tell it
     shares: Shares
-    within_others: float  # probability that it is within 0.1 m if the pose that the others expect is right
+    expected: PoseGaussian | None  # by the others
 
 
 def place_member(member: PosedMember, number: int, shares: Shares, agreed: Agreed) -> Placement:
@@ -250,21 +251,20 @@ def place_member(member: PosedMember, number: int, shares: Shares, agreed: Agree
 def place_between(shares: Shares, own: PoseGaussian | None, expected: PoseGaussian | None) -> Placement:
     """Return the mean of a photo's own pose and the one that others expect, or the likelier of them."""
     if expected is None:
-        return Placement(own, shares, 0.0)
+        return Placement(own, shares, None)
     gaussian = expected
     if own is not None:
         shares = shares.weigh_own(compare_errors(expected, own))
         if shares.right >= shares.missed:
             gaussian = expected.fuse(own)
-    offset = gaussian.pose.center_world - expected.pose.center_world
-    return Placement(gaussian, shares, probability_near(offset, expected.covariance[3:, 3:]))
+    return Placement(gaussian, shares, expected)
 
 
 def judge_member(
     member: PosedMember,
     number: int,
     support: Support,
-    min_confidence: float,
+    demand: Demand,
     agreed: Agreed,
     elsewhere: Sequence[Bundle],
     probabilities: Array,
@@ -284,7 +284,7 @@ def judge_member(
         return refuse(member, NOT_FOUND)
     places = [bundle.place(member.cam_from_bundle) for bundle in elsewhere]
     is_agreed = number in agreed.estimates
-    result = judge_placed(member, support, placed, is_agreed, places, probabilities, means, min_confidence)
+    result = judge_placed(member, support, placed, is_agreed, places, probabilities, means, demand)
     doubts = (UNSEEN,) if placed.shares.right < EVEN_ODDS else ()
     return replace(result, warnings=result.warnings + doubts + agreed.warnings)
 
@@ -297,22 +297,23 @@ def judge_placed(
     elsewhere: Sequence[Pose],
     probabilities: Array,
     means: Means,
-    min_confidence: float,
+    demand: Demand,
 ) -> Result:
     """Return the result of a photo that is placed by itself and by others.
 
     `is_agreed` if its own pose agrees with theirs. `elsewhere` are the poses that the photo has if the photos
     together are at other places; `probabilities` (K + 1,) are of all of these places, and of none.
     """
-    gaussian, shares, within_others = placed
+    gaussian, shares, expected = placed
     assert gaussian is not None
-    within = probability_within(gaussian)
+    within = demand.accuracy.probability(gaussian)
+    within_others = 0.0 if expected is None else demand.accuracy.probability_at(gaussian.pose, expected)
     alone = None
     if member.alone.status == LOCALIZED and is_agreed and member.alone.gaussian:
         alone = replace(member.alone.belief, within=min(within, member.alone.belief.within))
     belief = believe_together(shares, probabilities, within, within_others, alone)
     found = recalibrate_at(member, support, gaussian.pose, elsewhere, means.workers)
-    return judge_together(found, gaussian, belief, means, min_confidence)
+    return judge_together(found, gaussian, belief, means, demand.min_confidence)
 
 
 def weigh_local(share: float, expected: PoseGaussian | None, own: PoseGaussian) -> float:

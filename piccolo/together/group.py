@@ -21,6 +21,7 @@ from ..judge.probability import LOCALIZED
 from ..judge.result import Result
 from ..local_features.hypotheses import count_matches
 from ..localization.means import Means
+from ..problem.accuracy import Demand
 from ..scan_map.scan_map import ScanMap
 from .bundle import EVEN_ODDS, judge_placed, place_between, weigh_local
 from .bundle_search import NUM_BUNDLES, Support, find_support, weigh_bundles
@@ -75,13 +76,13 @@ def localize_group(
         settings = shots[0].settings
         with watch.stage("refine"):
             means = Means(settings.effort, workers, watch)
-            found = localize_linked(matched, means, settings.min_confidence)
+            found = localize_linked(matched, means, settings.demand)
         for k, (result, others) in found.items():
             grouped[order[k]] = Grouped(result, tuple(sorted(order[other] for other in others)))
     return [grouped[k] for k in range(len(shots))]
 
 
-def localize_linked(members: Mapping[int, Member], means: Means, min_confidence: float) -> dict[int, Grouped]:
+def localize_linked(members: Mapping[int, Member], means: Means, demand: Demand) -> dict[int, Grouped]:
     """Return the results of those photos that are localized together, by their numbers."""
     links = find_links({k: member.found.problem for k, member in members.items()}, means.workers)
     group = Group(links, members)
@@ -92,7 +93,7 @@ def localize_linked(members: Mapping[int, Member], means: Means, min_confidence:
             tested, probabilities = weigh_places(group, proposed, left, means)
             found: dict[int, Result] = {}
             if probabilities[0] >= EVEN_ODDS:
-                found = judge_group(group, tested, probabilities, means, min_confidence)
+                found = judge_group(group, tested, probabilities, means, demand)
             for k, result in found.items():
                 grouped[k] = Grouped(result, tuple(other for other in found if other != k))
             left -= found.keys() or tested[0].places.keys()
@@ -193,7 +194,7 @@ def examine_place(group: Group, places: Places, numbers: Collection[int], means:
 
 
 def judge_group(
-    group: Group, tested: Sequence[Tested], probabilities: Array, means: Means, min_confidence: float
+    group: Group, tested: Sequence[Tested], probabilities: Array, means: Means, demand: Demand
 ) -> dict[int, Result]:
     """Return the results of the photos that belong to the first of several places of their group."""
     best, *elsewhere = tested
@@ -217,7 +218,7 @@ def judge_group(
         poses = [elsewhere[k].places[number].pose for k in others]
         of_places = probabilities[[0, *(k + 1 for k in others)]]
         of_all = np.append(of_places, 1.0 - of_places.sum())
-        result = judge_placed(member, support, placed, number in own, poses, of_all, means, min_confidence)
+        result = judge_placed(member, support, placed, number in own, poses, of_all, means, demand)
         if result.status == LOCALIZED or not is_sure:
             results[number] = result
     return results

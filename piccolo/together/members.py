@@ -104,7 +104,7 @@ def find_alone(scan_map: ScanMap, shot: Shot, workers: Workers, watch: Stopwatch
             return None
         search = find_by_edges if problem.profile.follows_walls else find
         ended = search(problem, scan_map, means)
-        judged = judge(ended, means, settings.min_confidence, may_promote=False)
+        judged = judge(ended, means, settings.demand, may_promote=False)
         found.append(Member(ended.forget(), judged))
         if judged.status == LOCALIZED:
             break

@@ -33,7 +33,9 @@ from piccolo.jobs.interruption import Interruption, interruptible
 from piccolo.jobs.memory import limit_memory
 from piccolo.jobs.threads import Workers
 from piccolo.judge.result import UNREADABLE
-from piccolo.photo_reader import describe_failure, settings_json
+from piccolo.photo_reader import Settings, describe_failure, settings_json
+from piccolo.problem.accuracy import PAPER_ACCURACY
+from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.result_files import check_scan, read_results
 from piccolo.scan import Scan
 from piccolo.scan_map.open_map import scan_sha256_of
@@ -73,8 +75,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(group, "--force", "also take --results of other clouds than the scene's")
     option(group, "--cache FOLDER", options.CACHE_TEXT)
     group = parser.add_argument_group("tables and plots")
-    option(group, "--max-distance M", "position error below which a pose is correct [m]", default=0.1)
-    option(group, "--max-angle DEG", "rotation error below which a pose is correct", default=5.0)
+    text = "error below which a pose is correct (default: that of --accuracy)"
+    option(group, "--max-distance M", f"position {text}")
+    option(group, "--max-angle DEG", f"rotation {text}")
     option(group, "--csv FILE", "write a line per query; - is stdout, also for the other files")
     option(group, "--markdown FILE", "write the tables to this file too")
     option(group, "--errors PNG", "plot: fraction of queries below each error, and recall over thresholds")
@@ -91,7 +94,8 @@ def check_usage(arguments: Arguments) -> None:
         raise UsageError("--scenes: needed with --out and --results, not with --compare")
     if arguments.compare and (arguments.csv or arguments.risk):
         raise UsageError("--csv, --risk: not with --compare, they show one run")
-    if not (0.0 < arguments.max_distance < np.inf and 0.0 < arguments.max_angle < np.inf):
+    limits = arguments.max_distance, arguments.max_angle
+    if not all(0.0 < limit < np.inf for limit in limits if limit is not None):
         raise UsageError("--max-distance, --max-angle: wanted numbers above 0")
     arguments.check_least(jobs=1, threads=1)
     execution.check_execution(arguments)
@@ -99,6 +103,14 @@ def check_usage(arguments: Arguments) -> None:
         check_suffix(f"--{option_}", getattr(arguments, option_), (".png",))
     if arguments.out and is_stream(arguments.out):
         raise UsageError(f"--out {arguments.out}: a run is read again to be resumed, wanted a file")
+
+
+def thresholds_from(arguments: Arguments, settings: Settings) -> Thresholds:
+    """Return the errors below which poses are correct: by default those that a localized pose may have."""
+    wanted = settings.accuracy if isinstance(settings, CoarseToFineSettings) else PAPER_ACCURACY
+    metres = wanted.metres if arguments.max_distance is None else arguments.max_distance
+    degrees = wanted.degrees if arguments.max_angle is None else arguments.max_angle
+    return Thresholds(metres, float(np.radians(degrees)))
 
 
 def report_of(scenes: Sequence[Scene], rows: Sequence[QueryResult], thresholds: Thresholds) -> str:
@@ -267,7 +279,7 @@ def main(arguments: Arguments) -> int:
     with checking_options():
         limit_memory(arguments.max_memory)
         config = cli_settings.localizer_from(arguments)
-    thresholds = Thresholds(arguments.max_distance, float(np.radians(arguments.max_angle)))
+    thresholds = thresholds_from(arguments, config.settings)
     scenes = find_scenes(arguments.scenes or [])
     check_files(arguments, input_files(scenes))
     if arguments.compare:

@@ -117,8 +117,7 @@ def join_beside(
             if fused is None:
                 continue
             mean = fused
-        offset = mean.pose.center_world - expected.pose.center_world
-        share = probability_near(offset, expected.covariance[3:, 3:])
+        share = probability_near(mean.pose, expected, RIGHT)  # of the place, however exact it must be
         return replace(own, pose=mean.pose, gaussian=mean), share
     return own, 0.0
 

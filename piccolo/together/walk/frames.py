@@ -18,7 +18,7 @@ from ...arrays import Array
 from ...errors import InputError
 from ...geometry.nearness import ONE_ANSWER
 from ...geometry.pose import Pose
-from ...geometry.pose_gaussian import PoseGaussian, probability_within
+from ...geometry.pose_gaussian import PoseGaussian
 from ...judge.candidate import Candidate
 from ...judge.probability import LOCALIZED
 from ...judge.result import Result
@@ -54,11 +54,6 @@ class State:
     def is_sure(self) -> bool:
         """True if the photo is sure of the pose, by itself or by a frame beside that confirms it."""
         return self.log_odds + self.gain >= SURE_ODDS
-
-    @property
-    def within(self) -> float:
-        """Probability that the pose is within 0.1 m, if its place is right."""
-        return probability_within(self.gaussian)
 
 
 @dataclass

@@ -20,6 +20,7 @@ from ...arrays import Array, Mask
 from ...geometry.nearness import ONE_ANSWER
 from ...geometry.pose import Pose, carry
 from ...judge.result_parts import Gap
+from ...problem.accuracy import Accuracy, Demand
 from ...scan_map.camera_positions import FreeSpace
 from .frames import JUMP_LOG, MOST_EXPECTED, MOST_ODDS, REACH_SLACK, Frame, Motion, State, state_centers
 
@@ -290,10 +291,15 @@ class Ranked(NamedTuple):
         """True if the photo is sure of the first pose, by itself or by a frame beside."""
         return any(state.is_sure for state in self.states[:1])
 
-    @property
-    def confidence(self) -> float:
-        """Probability of the first pose; 0 if there is none."""
-        return float(self.probabilities[0]) * self.states[0].within if self.states else 0.0
+    def is_enough(self, demand: Demand) -> bool:
+        """Return True if the first pose is right with the confidence demanded."""
+        return self.confidence(demand.accuracy) >= demand.min_confidence
+
+    def confidence(self, accuracy: Accuracy) -> float:
+        """Return the probability that the first pose is so exact; 0 if there is none."""
+        if not self.states:
+            return 0.0
+        return float(self.probabilities[0]) * accuracy.probability(self.states[0].gaussian)
 
 
 NOTHING = Ranked([], np.empty(0))

@@ -37,7 +37,7 @@ def make_localizations(tracker: Tracker, show: Progress = no_progress) -> list[t
     frames = tracker.frames
     motion = tracker.motion
     found = [make_localization(tracker, f, belief) for f, belief in zip(frames, beliefs, strict=True)]
-    sure = [k for k, f in enumerate(found) if motion.is_timed and f.gaussian and f.confidence > EVEN]
+    sure = [k for k, f in enumerate(found) if motion.is_timed and f.gaussian and f.place_probability > EVEN]
     located = [gaussian for k in sure if (gaussian := found[k].gaussian)]
     begins = [0, *(n for n, k in enumerate(sure) if n and path.gaps[k]), len(sure)]
     for lo, hi in pairwise(begins):
@@ -97,7 +97,8 @@ def make_localization(tracker: Tracker, frame: Frame, ranked: Ranked) -> Result:
     is_own = best.is_refined and best.end is None  # as only the search ends
     own = frame.alone if is_own and frame.alone else nothing_found()
     contradicted = contradictions(scan_map, best.pose, tracker.settings.prior)
-    belief = make_belief(ranked.probabilities[: 1 + len(others)], best.within)
+    within = tracker.settings.accuracy.probability(best.gaussian)
+    belief = make_belief(ranked.probabilities[: 1 + len(others)], within)
     described = Result(
         best_pose=scan_map.to_world(best.pose),
         loss=own.loss,

@@ -14,6 +14,7 @@ import numpy as np
 from ...arguments import MIN_CONFIDENCE
 from ...geometry.pose import Pose, carry
 from ...jobs.threads import Progress, one_blas_thread
+from ...problem.accuracy import Demand
 from ...problem.problem import Problem
 from .expectation import Expected, Followed
 from .following import find_near, refine_state
@@ -60,7 +61,7 @@ def _search_unsure(tracker: Tracker, beliefs: Sequence[Ranked], show: Progress) 
     A pose beyond reach of sure frames does not count. A frame that was found stays as it is, unless the photo
     is sure by itself.
     """
-    asked = list_unsure(tracker.frames, beliefs, tracker.settings.min_confidence)
+    asked = list_unsure(tracker.frames, beliefs, tracker.settings.demand)
     is_any_found = False
     for k in show(iter(asked), len(asked), "search"):
         problem = tracker.problem_of(k)
@@ -77,14 +78,14 @@ def _search_unsure(tracker: Tracker, beliefs: Sequence[Ranked], show: Progress) 
     return is_any_found
 
 
-def list_unsure(frames: Sequence[Frame], beliefs: Sequence[Ranked], min_confidence: float) -> list[int]:
+def list_unsure(frames: Sequence[Frame], beliefs: Sequence[Ranked], demand: Demand) -> list[int]:
     """List frames that are not localized, and were not searched by themselves.
 
     Of each run of such frames some are listed, evenly spread: what one of them finds, the others are found
     from.
     """
     is_unsure = [
-        frame.alone is None and belief.confidence < min_confidence
+        frame.alone is None and not belief.is_enough(demand)
         for frame, belief in zip(frames, beliefs, strict=True)
     ]
     listed: list[int] = []
@@ -136,6 +137,7 @@ def _refine(tracker: Tracker, path: Path, k: int) -> None:
 def _find_lost(tracker: Tracker, path: Path, beliefs: list[Ranked], k: int) -> None:
     """Track a frame that is not sure from where it is to be expected, or look for it near sure ones."""
     frames = tracker.frames
+    accuracy = tracker.settings.accuracy
     ways = _list_ways(tracker, beliefs, k)
     problem = tracker.problem_of(k) if ways else None
     if problem is None:
@@ -148,7 +150,7 @@ def _find_lost(tracker: Tracker, path: Path, beliefs: list[Ranked], k: int) -> N
             before = frames[k]
             _hang(frames, path, k, begin, found)
             belief = believe(frames, path, k)
-            if belief.confidence < beliefs[k].confidence:
+            if belief.confidence(accuracy) < beliefs[k].confidence(accuracy):
                 frames[k] = before
                 continue
             beliefs[k] = belief
@@ -172,7 +174,7 @@ def _list_ways(tracker: Tracker, beliefs: Sequence[Ranked], k: int) -> list[tupl
     if frame.key is not None and belief.expected is not None:
         expected = Expected(belief.expected, tracker.motion.reach(0.0), belief.expected)
         ways = [(frame.key, partial(find_near, expected=expected, means=tracker.means))]
-    is_unsure = belief.confidence < tracker.settings.min_confidence or not belief.is_confirmed
+    is_unsure = not (belief.is_enough(tracker.settings.demand) and belief.is_confirmed)
     is_kept = frame.is_key and belief.is_sure
     if is_unsure and not is_kept and (sides := _list_sure(tracker.frames, beliefs, k)):
         nearest = [side[0] for side in sides] if len(sides) > 1 else sides[0]
