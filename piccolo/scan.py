@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache, partial
+from functools import partial
 from itertools import repeat
 from pathlib import Path
 from typing import Any
@@ -32,14 +32,12 @@ from .scan_map.open_map import write_map
 from .scan_map.scan_map import ScanMap, check_within
 from .scan_photo import Asked, localize_photo
 from .scan_walk import Walk
-from .second_look import Looking, Place
-from .together.beside import SurePhoto
+from .second_look import Looking, Others
 from .together.bundle_adjustment import RelativeScale
-from .together.second_looks import MOST_PICTURES, Look, localize_in_order
+from .together.second_looks import Look, localize_in_order
 from .together.walk.frames import Motion
 from .together.walk.tracker import Tracker
 
-BESIDE = "photos beside others"
 OPTIONS = "prior", "gravity", "accuracy", "min_confidence"  # of photos
 ONLY_DEFAULT = ("refine_focal", "gravity_vector")  # options of photos that the preset paper does not have
 Picture = File | Bytes | Photo  # a path or an array (H, W, 3) is a photo without options
@@ -174,10 +172,7 @@ class Scan:
     def localize_in_order(self, asked: Sequence[Asked], min_confidence: float) -> Iterator[Result]:
         """Localize photos that help each other; yield results in order, each when it is final."""
         known: dict[tuple[str, str | None], Asked] = {}  # by name and digest
-
-        @lru_cache(MOST_PICTURES)
-        def place(result: Result) -> SurePhoto | None:
-            return self.place_keypoints(known[result.pano, result.source.pano_sha256], result)
+        others = Others(self, lambda result: known[result.pano, result.source.pano_sha256])
 
         def localize(one: Asked) -> Result:
             result = self.try_photo(one)
@@ -185,7 +180,7 @@ class Scan:
             return result
 
         def look_again(one: Asked, look: Look) -> Result:
-            return self.try_photo(one, partial(self.look_again, look=look, place=place))
+            return self.try_photo(one, partial(self.look_again, look=look, others=others))
 
         return localize_in_order(asked, localize, look_again, min_confidence)
 
@@ -200,16 +195,16 @@ class Scan:
         except Exception as error:
             return self.reader.make_failed(asked.photo, error, asked.settings)
 
-    def look_again(self, asked: Asked, look: Look, place: Place) -> Result:
-        """Localize a photo again: with the focal length that others tell, or beside others."""
-        scan_map, settings = self.require_default_method(BESIDE, asked.settings)
+    def look_again(self, asked: Asked, look: Look, others: Others) -> Result:
+        """Localize a photo again: with the focal length that others tell, or beside or with others."""
         first = look.first or self.localize_photo(asked, look.focal)
-        return Looking(scan_map, self.reader, self.workers).look(asked.photo, first, look, place, settings)
+        return self.looking.look(asked, first, look, others)
 
-    def place_keypoints(self, asked: Asked, result: Result) -> SurePhoto | None:
-        """Return the keypoints of a photo that is localized; None if it is another, or none, by now."""
-        scan_map, settings = self.require_default_method(BESIDE, asked.settings)
-        return Looking(scan_map, self.reader, self.workers).place(asked.photo, result, settings)
+    @property
+    def looking(self) -> Looking:
+        """The scan as second looks need it; InputError for the preset paper."""
+        scan_map, _ = self.require_default_method("photos beside others", self.settings)
+        return Looking(scan_map, self.reader, self.workers)
 
     def localize_bundle(
         self,

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 from .errors import InputError
 from .geometry.pose import Pose
-from .jobs.memory import check_memory
 from .jobs.threads import Stopwatch, Workers
 from .judge.result import Result
 from .localization.localize import has_guessed_focal
@@ -17,8 +16,7 @@ from .problem.settings import CoarseToFineSettings
 from .scan_map.scan_map import ScanMap
 from .together.bundle import Posed, localize_bundle
 from .together.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
-
-MEMORY_OF_PHOTO = 8e7  # [byte] that a photo keeps while others of its bundle are localized
+from .together.members import check_photos
 
 
 class AskedPosed(NamedTuple):
@@ -44,7 +42,7 @@ def localize_posed(
     if not asked:
         return []
     watch = Stopwatch()
-    check_memory(len(asked) * MEMORY_OF_PHOTO, f"{len(asked)} photos together", "localize fewer together")
+    check_photos(len(asked))
     taken = [reader.take(one.photo, watch) for one in asked]
     if any(has_guessed_focal(picture) for picture, _ in taken):
         raise InputError("`relative_poses`: found a focal length that is a guess, wanted a known one")

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from .jobs.memory import check_memory
 from .jobs.threads import Stopwatch, Workers
 from .judge.result import Result
 from .judge.result_parts import Beside
@@ -15,10 +14,9 @@ from .panorama.photo import PhotoFacts
 from .photo import Photo
 from .photo_reader import PhotoReader
 from .problem.settings import CoarseToFineSettings
-from .scan_bundle import MEMORY_OF_PHOTO
 from .scan_map.scan_map import ScanMap
 from .together.group import localize_group
-from .together.members import Shot
+from .together.members import Shot, check_photos
 from .together.second_looks import digest_of
 
 OF_RESULTS = {"together": True}  # in their settings
@@ -40,7 +38,7 @@ def localize_photos_together(
     One that can't be read has a result that says so.
     """
     watch = Stopwatch()
-    check_memory(len(asked) * MEMORY_OF_PHOTO, f"{len(asked)} photos together", "localize fewer together")
+    check_photos(len(asked))
     results: dict[int, Result] = {}
     taken: dict[int, tuple[Panorama, PhotoFacts]] = {}
     for k, one in enumerate(asked):

@@ -1,26 +1,28 @@
-"""A second look at one photo of a scan: with the focal length that others tell, or beside sure ones."""
+"""Second looks at photos of a scan: with the focal length that others tell, beside sure ones, or together."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from typing import Protocol
 
 from .errors import InputError, is_passing
-from .files.json_file import reading_once
 from .geometry.nearness import CONFIRMED
 from .jobs.threads import Stopwatch, Workers
 from .judge.result import Result
-from .judge.result_parts import Beside
+from .judge.result_parts import Beside, FocalLength
 from .localization.localize import has_guessed_focal
 from .localization.places import add_places
-from .panorama.photo import read_photo_facts
+from .panorama import Panorama
+from .panorama.photo import PhotoFacts
 from .photo import Photo
 from .photo_reader import PhotoReader
 from .problem.problem import prepare_problem
 from .problem.settings import CoarseToFineSettings
 from .scan_map.scan_map import ScanMap
+from .scan_photo import Asked
+from .together.among import Known, localize_among
 from .together.beside import SurePhoto, localize_beside, place_sure
-from .together.second_looks import Look
-
-Place = Callable[[Result], SurePhoto | None]  # of a photo that is sure, by its result
+from .together.second_looks import MOST_PICTURES, Look, follow, is_doubtful, names_of
 
 
 @dataclass(frozen=True)
@@ -33,31 +35,70 @@ class Looking:
 
     def place(self, photo: Photo, result: Result, settings: CoarseToFineSettings) -> SurePhoto | None:
         """Return the keypoints of a photo that is localized; None if it is another, or none, by now."""
+        taken = self.take_again(photo.with_refined_camera(result.cameras), result, Stopwatch())
+        if taken is None or result.best_pose is None:
+            return None
+        problem = prepare_problem(taken[0], self.scan_map, settings.prior, settings.gravity, settings.method)
+        return place_sure(problem, result.best_pose, result.covariance, result.confidence, self.workers)
+
+    def take_again(
+        self, photo: Photo, known: Result, watch: Stopwatch, focal: FocalLength | None = None
+    ) -> tuple[Panorama, PhotoFacts] | None:
+        """Read a photo of which a result is known; None if it is another, or none, by now."""
         try:
-            with reading_once():
-                picture = self.reader.read(photo.with_refined_camera(result.cameras))
-                digest = read_photo_facts(photo).sha256
+            taken = self.reader.take(photo, watch, focal)
         except (OSError, InputError) as error:
             if is_passing(error):
                 raise
             return None
-        if digest != result.source.pano_sha256 or result.best_pose is None:
-            return None
-        problem = prepare_problem(picture, self.scan_map, settings.prior, settings.gravity, settings.method)
-        return place_sure(problem, result.best_pose, result.covariance, result.confidence, self.workers)
+        return taken if taken[1].sha256 == known.source.pano_sha256 else None
 
-    def look(
-        self, photo: Photo, first: Result, look: Look, place: Place, settings: CoarseToFineSettings
-    ) -> Result:
+    def localize_series(self, asked: Sequence[Asked], known: Sequence[Result]) -> dict[Result, Result]:
+        """Localize those photos of a series that are not sure with the others.
+
+        Returns the results of those that are found by others, by what was known of each.
+        """
+        watch = Stopwatch()
+        blanks: dict[Result, Result] = {}
+
+        def take(photo: Photo, result: Result, settings: CoarseToFineSettings) -> Panorama | None:
+            is_open = is_doubtful(result)
+            by_camera = photo if is_open else photo.with_refined_camera(result.cameras)
+            taken = self.take_again(by_camera, result, watch, result.focal_length if is_open else None)
+            if taken is None:
+                return None
+            blanks[result] = self.reader.make_blank(photo, *taken, settings, {})
+            return taken[0]
+
+        photos = [
+            Known(partial(take, photo, result, settings), settings, result, is_doubtful(result))
+            for (photo, settings), result in zip(asked, known, strict=True)
+            if isinstance(settings, CoarseToFineSettings)
+        ]
+        found = localize_among(self.scan_map, photos, self.workers, watch)
+        seconds = {stage: spent / len(asked) for stage, spent in watch.seconds.items()}
+        results = {}
+        for k, (result, others) in found.items():
+            before = photos[k].result
+            blank = replace(blanks[before], seconds=seconds)
+            placed = follow(before, add_places(self.scan_map, result).complete(blank))
+            names = tuple(photos[other].result.pano for other in others)
+            results[before] = replace(placed, beside=Beside(names, ""))
+        return results
+
+    def look(self, asked: Asked, first: Result, look: Look, others: "Others") -> Result:
         """Return the result of a look at a photo, of which `first` is that without the others beside it."""
+        if look.series:
+            return take_surer(first, others.localize_series(look.series).get(first), look.asked_sha256)
         if not look.beside:
             return replace(first, beside=None)
 
         def list_pictures() -> dict[str, SurePhoto]:
-            found = ((result.pano, place(result)) for result in look.beside)
+            found = ((result.pano, others.place(result)) for result in look.beside)
             return {name: picture for name, picture in found if picture}
 
-        found, names = self.localize_again(photo, first, list_pictures, settings)
+        assert isinstance(asked.settings, CoarseToFineSettings)
+        found, names = self.localize_again(asked.photo, first, list_pictures, asked.settings)
         return replace(found, beside=Beside(names, look.asked_sha256))
 
     def localize_again(
@@ -73,8 +114,7 @@ class Looking:
         one. A photo whose focal length is a guess is not looked at.
         """
         watch = Stopwatch(dict(first.seconds))
-        focal = first.focal_length
-        picture, facts = self.reader.take(photo, watch, focal)
+        picture, facts = self.reader.take(photo, watch, first.focal_length)
         is_another = facts.sha256 != first.source.pano_sha256
         if has_guessed_focal(picture) or self.scan_map.has_shape or is_another:
             return first, ()
@@ -89,10 +129,42 @@ class Looking:
         is_other = before and after and not CONFIRMED.holds(after, before)
         if not names or not (is_surer or is_other):
             return first, ()
-        if focal is not None:
-            found = replace(found, focal_length=focal.update(found.focal_length))
-        elif found.focal_length is not None:  # only what a photo says alone counts for others
-            alone = replace(found.focal_length, picture_px=None, picture_std_px=None)
-            found = replace(found, focal_length=alone)
         blank = self.reader.make_blank(photo, picture, facts, settings, watch.seconds)
-        return replace(add_places(self.scan_map, found).complete(blank), gps_prior=first.gps_prior), names
+        return follow(first, add_places(self.scan_map, found).complete(blank)), names
+
+
+def take_surer(first: Result, found: Result | None, asked_sha256: str) -> Result:
+    """Return the result of a photo with its series, or the first one if that is as sure."""
+    if found is None or found.confidence <= first.confidence:
+        beside = first.beside or Beside((), asked_sha256)
+        return replace(first, beside=replace(beside, is_together=True))
+    return replace(found, beside=Beside(names_of(found), asked_sha256, is_together=True))
+
+
+class Opened(Protocol):
+    """A scan that looks are taken in; one of the preset paper has none."""
+
+    @property
+    def looking(self) -> Looking:
+        """Return it for looks; InputError if it has none."""
+
+
+class Others:
+    """Other photos of a batch, of which a look asks what it needs."""
+
+    def __init__(self, scan: Opened, ask: Callable[[Result], Asked]) -> None:
+        """Ask in a scan; `ask` returns a photo by its result, with its settings."""
+        self._scan = scan
+        self._ask = ask
+        self.place = lru_cache(MOST_PICTURES)(self._place)
+        self.localize_series = lru_cache(1)(self._localize_series)  # those of one follow each other
+
+    def _place(self, result: Result) -> SurePhoto | None:
+        """Return the keypoints of a photo that is sure, by its result."""
+        photo, settings = self._ask(result)
+        assert isinstance(settings, CoarseToFineSettings)
+        return self._scan.looking.place(photo, result, settings)
+
+    def _localize_series(self, series: tuple[Result, ...]) -> Mapping[Result, Result]:
+        """Return the results of photos that are found by others, by what was known of each."""
+        return self._scan.looking.localize_series([self._ask(result) for result in series], series)

@@ -37,7 +37,7 @@ from piccolo.judge.result_parts import Beside, Source
 from piccolo.photo import Photo
 from piccolo.result_files import read_results
 from piccolo.scan import Scan
-from piccolo.second_look import Looking
+from piccolo.second_look import Looking, Others
 from piccolo.together.second_looks import MOST_PICTURES, Look, list_looks_beside, localize_in_order
 from research.synthetic.world import render_picture
 
@@ -201,7 +201,8 @@ def looked(monkeypatch):
 
     monkeypatch.setattr(Scan, "localize_photo", localize)
     monkeypatch.setattr(Looking, "localize_again", localize_again)
-    monkeypatch.setattr(Localizer, "place_keypoints", lambda self, scan, line: line)
+    monkeypatch.setattr(Looking, "place", lambda self, photo, result, settings: result)
+    monkeypatch.setattr(Looking, "localize_series", lambda self, asked, known: {})
     return looked
 
 
@@ -273,8 +274,8 @@ def test_a_second_look_is_of_the_photos_that_there_are(scene, photos, tmp_path, 
         (photos / name).unlink()
         run_again("b.jpg", "d.jpg")
     (photos / "c.jpg").unlink()
-    run_again()  # with nothing beside them they are as they were alone
-    assert [line[1:] for line in _lines(out.read_text())] == [("ambiguous", None)] * 2
+    run_again()  # with nothing beside them they are as they were alone, and asked together
+    assert [line[1:] for line in _lines(out.read_text())] == [("ambiguous", [])] * 2
     capsys.readouterr()
 
 
@@ -322,7 +323,7 @@ def test_a_look_that_fails_is_told_and_leaves_the_result(
     monkeypatch.setattr(Looking, "localize_again", localize_again)
     assert _run(scene, photos, "--out", out, "--quiet") == 1
     assert "disk: cannot be used (Input/output error)" in capsys.readouterr().err
-    assert _lines(out.read_text())[1] == ("b.jpg", "ambiguous", None)
+    assert _lines(out.read_text())[1] == ("b.jpg", "ambiguous", [])
 
     def stop(*_):
         raise RuntimeError
@@ -371,7 +372,8 @@ def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypat
     sure = scan.localize(str(photo))
     settings = scan.settings, scan.cloud_settings
     localizer = Localizer((scene / "cloud.ply",), *settings, Photo(""), None)
-    located, confidence, gaussian = localizer.place_keypoints(scan, sure)
+    others = Others(scan, localizer.ask_by_result)
+    located, confidence, gaussian = others.place(sure)
     assert confidence == sure.confidence
     in_world = describe_errors(gaussian, scan.prepared.R_map_from_world.T).matrix
     np.testing.assert_allclose(in_world, sure.covariance.matrix, atol=1e-9)
@@ -381,7 +383,7 @@ def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypat
     asked = []
     others = [replace(sure, pano=name) for name in "bcd"]
     with monkeypatch.context() as patch:
-        patch.setattr(Localizer, "place_keypoints", lambda self, scan, one: asked.append(one.pano))
+        patch.setattr(Looking, "place", lambda self, photo, one, settings: asked.append(one.pano))
         patch.setattr(Looking, "localize_again", lambda self, path, first, found, *_: (first, (*found(),)))
         answer = localizer.answer_in(scan)
         for beside in (others[:2], others[1:]):
@@ -389,8 +391,8 @@ def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypat
             answer(localizer.task(photo)._replace(look=look))
     assert asked == ["b", "c", "d"]
     photo.write_bytes((scene / "images" / "clean_1.jpg").read_bytes())
-    assert localizer.place_keypoints(scan, sure) is None
+    assert Others(scan, localizer.ask_by_result).place(sure) is None
     photo.unlink()
-    assert localizer.place_keypoints(scan, sure) is None
+    assert Others(scan, localizer.ask_by_result).place(sure) is None
     with pytest.raises(InputError, match="photos beside others: not available with the preset paper"):
         scan.require_default_method("photos beside others", None)

@@ -106,6 +106,38 @@ def test_photos_of_a_folder_are_localized_together_and_named(folder, tmp_path, c
         }
 
 
+def test_a_batch_looks_at_photos_that_are_not_sure_together(folder, tmp_path, capsys):
+    """One of three is localized alone; all doors say the same, and a second run has nothing to do."""
+    out = tmp_path / "poses.jsonl"
+    names = [folder / f"{name}.png" for name in range(3)]
+    words = _command(folder)
+    begin = words.index("--pano")
+    words[begin + 1 : begin + 2] = list(map(str, names))
+    main([*words, "--out", str(out)])
+    lines = [untimed_line(line) for line in out.read_text().splitlines()]
+    assert [line["status"] for line in lines] == ["localized"] * 3
+    assert lines[2]["beside"] is None, "it is localized alone"
+    for k in (0, 1):
+        others = [name.rpartition("/")[2] for name in lines[k]["beside"]["photos"]]
+        assert sorted(others) == [f"{n}.png" for n in range(3) if n != k]
+        assert lines[k]["beside"]["is_together"]
+    capsys.readouterr()
+    before = out.read_bytes()
+    main([*words, "--out", str(out)])
+    assert "nothing is left to do" in capsys.readouterr().err
+    assert out.read_bytes() == before
+    scan = open_scan(rooms.map_path(SEED))
+    photos = [Photo(str(name), focal_px=FOCAL) for name in names]
+    assert [untimed_line(r.to_json()) for r in scan.localize_many(photos, gravity="known")] == lines
+    pictures = {name.name: name.read_bytes() for name in names}
+    with serving("--cloud", rooms.map_path(SEED), "--jobs", "1") as client:
+        asked = {"photo": {"focal_px": FOCAL}, "gravity": "known"}
+        _, _, body = client.post_all("/localize", pictures, asked)
+    for answer, line in zip(map(untimed_line, body.decode().splitlines()), lines, strict=True):
+        assert answer | {"pano": line["pano"], "beside": line["beside"]} == line
+        assert (answer["beside"] or {}).get("is_together") == (line["beside"] or {}).get("is_together")
+
+
 @pytest.mark.parametrize("options", [["--walk"], ["--relative", "poses.txt"], ["--jobs", "2"], ["--labels"]])
 def test_what_does_not_go_with_it_is_refused_with_the_reason(folder, options, capsys):
     assert main(_command(folder, "--together", *options)) == 2

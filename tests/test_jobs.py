@@ -62,10 +62,10 @@ def test_several_processes_write_the_same_files(scene, tmp_path, capsys):
 class Deadly(Localizer):
     """Localizes; one photo kills the process at work on it."""
 
-    def answer(self, scan, place_keypoints, task):
+    def answer(self, scan, others, task):
         if task.photo.path.name == "deadly.jpg":
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().answer(scan, place_keypoints, task)
+        return super().answer(scan, others, task)
 
 
 @pytest.mark.process

@@ -30,9 +30,8 @@ from ..scan_group import AskedTogether, localize_photos_together
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
 from ..scan_photo import Asked
-from ..second_look import Place
-from ..together.beside import SurePhoto
-from ..together.second_looks import MOST_PICTURES, Look, localize_in_order
+from ..second_look import Others
+from ..together.second_looks import Look, localize_in_order
 from ..views.pictures import encode_image, overlay_png
 from .inputs import PriorTable
 
@@ -161,7 +160,7 @@ class Localizer:
 
     def answer_in(self, scan: Scan) -> Callable[[Task], Answer]:
         """Return what answers tasks in an opened scan."""
-        return partial(self.answer, scan, lru_cache(MOST_PICTURES)(partial(self.place_keypoints, scan)))
+        return partial(self.answer, scan, Others(scan, self.ask_by_result))
 
     def open_scan(self, workers: Workers) -> Scan:
         """Read and prepare the scan."""
@@ -173,11 +172,8 @@ class Localizer:
         scan = open_files(paths, self.cloud_settings, self.settings, self.cache, workers)
         return replace(scan, name=self.name)
 
-    def answer(self, scan: Scan, place_keypoints: Place, task: Task) -> Answer:
-        """Localize one photo, and make the pictures asked for; of one that can't be read say why.
-
-        `place_keypoints` returns a photo that is sure by its result.
-        """
+    def answer(self, scan: Scan, others: Others, task: Task) -> Answer:
+        """Localize one photo, and make the pictures asked for; of one that can't be read say why."""
         name = task.photo.name
         trace = Trace(self.is_traced)
         with task.place(self.folder) as photo, reading_once():
@@ -185,7 +181,7 @@ class Localizer:
                 if task.look is None:
                     found = scan.localize_photo(Asked(photo, task.settings), trace=trace)
                 else:
-                    found = scan.look_again(Asked(photo, task.settings), task.look, place_keypoints)
+                    found = scan.look_again(Asked(photo, task.settings), task.look, others)
                 overlay, mask = self.make_pictures(scan, photo, found)
             except Exception as error:
                 return Answer(scan.reader.make_failed(photo, error, task.settings, name))
@@ -193,11 +189,10 @@ class Localizer:
         result = replace(found, pano=name, warnings=warnings)
         return Answer(result, warnings[len(scan.warnings) :], overlay, mask, tuple(trace.steps))
 
-    def place_keypoints(self, scan: Scan, result: Result) -> SurePhoto | None:
-        """Return the keypoints of a photo that is sure, by its result; None if it is another now."""
+    def ask_by_result(self, result: Result) -> Asked:
+        """Return the photo of a result, and its settings."""
         photo, settings = self.ask(Path(result.pano))
-        photo = replace(photo, picture=self.folder / photo.path)
-        return scan.place_keypoints(Asked(photo, settings), result)
+        return Asked(replace(photo, picture=self.folder / photo.path), settings)
 
     def answer_in_order(self, scan: Scan, tasks: Sequence[Task]) -> list[Result]:
         """Localize photos that were sent together, of the same options, and help each other."""

@@ -100,6 +100,7 @@ class Beside:
 
     photos: tuple[str, ...]  # paths of those that show the same, those with the most matches first
     asked_sha256: str  # digest of all that were asked
+    is_together: bool = False  # those that were taken with it were asked together
 
 
 @dataclass(frozen=True)

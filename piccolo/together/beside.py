@@ -66,11 +66,16 @@ def place_sure(
 ) -> SurePhoto:
     """Return the keypoints of a photo that is localized, and its pose with its errors."""
     pose = problem.scan_map.from_world(pose_world)
-    gaussian = None
-    if covariance is not None:
-        in_map = turn_positions(covariance.matrix, problem.scan_map.R_map_from_world)
-        gaussian = split_errors(problem, pose, in_map)
+    gaussian = recall_gaussian(problem, pose, covariance)
     return SurePhoto(place_keypoints(problem, pose, workers), confidence, gaussian)
+
+
+def recall_gaussian(problem: Problem, pose: Pose, covariance: PoseCovariance | None) -> PoseGaussian | None:
+    """Return a photo's pose in the map with its errors; those of the scan are common."""
+    if covariance is None:
+        return None
+    in_map = turn_positions(covariance.matrix, problem.scan_map.R_map_from_world)
+    return split_errors(problem, pose, in_map)
 
 
 @one_blas_thread()

@@ -100,6 +100,11 @@ class Links:
 def find_links(problems: Mapping[int, Problem], workers: Workers) -> Links:
     """Match the photos with each other; many, each with those that look most like it."""
     keypoints = {number: problem.photo.seen(workers).keypoints for number, problem in problems.items()}
+    return Links(problems, keypoints, match_each(keypoints, workers), workers)
+
+
+def match_each(keypoints: Mapping[int, Keypoints], workers: Workers) -> dict[tuple[int, int], Pair]:
+    """Return the matches of those photos that may show the same, both ways."""
     asked = list_pairs(keypoints, workers)
     found = workers.map(lambda two: match_two(keypoints[two[0]], keypoints[two[1]]), asked, "match")
     pairs: dict[tuple[int, int], Pair] = {}
@@ -107,7 +112,7 @@ def find_links(problems: Mapping[int, Problem], workers: Workers) -> Links:
         if len(mine) >= LEAST_LINKED:
             pairs[one, other] = mine, theirs
             pairs[other, one] = theirs, mine
-    return Links(problems, keypoints, pairs, workers)
+    return pairs
 
 
 def list_pairs(keypoints: Mapping[int, Keypoints], workers: Workers) -> list[tuple[int, int]]:

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from ..jobs.memory import check_memory
 from ..jobs.threads import Stopwatch, Workers
 from ..judge.candidate import Candidate
 from ..judge.consensus import MOST_CONFLICT, Consensus
@@ -46,6 +47,14 @@ class Member:
             return []
         places = self.alone.belief.sound_places[:-1].tolist()
         return list(zip(self.found.selection.candidates, places, strict=False))
+
+
+MEMORY_OF_PHOTO = 8e7  # [byte] that a photo keeps while others are localized
+
+
+def check_photos(number: int) -> None:
+    """Refuse more photos together than memory is left for."""
+    check_memory(number * MEMORY_OF_PHOTO, f"{number} photos together", "localize fewer together")
 
 
 class Shot(NamedTuple):

@@ -1,7 +1,8 @@
 """Which photos of a batch get a second look, and what the photos of one camera say together.
 
-Photos that are unsure, or off in focal length, are looked at again with the focal length of the others, and
-then beside those that are sure.
+Photos that are unsure, or off in focal length, are looked at again with the focal length of the others, then
+beside those that are sure, then together with those that were taken with them. A look beside sure photos, any
+of the batch, costs their matches only; together, photos need none that is sure, but are searched once more.
 """
 
 import json
@@ -17,8 +18,9 @@ from ..judge.conclude import follow_consensus
 from ..judge.consensus import Consensus
 from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..judge.result import Result
-from ..judge.result_parts import FocalLength
+from ..judge.result_parts import Beside, FocalLength
 from ..judge.sure import SURE_CONFIDENCE
+from .series import list_series
 
 MOST_PICTURES = 200  # beside which a photo is looked at again
 BETTER = 0.7  # others' deviation must be below this fraction of the photo's own
@@ -36,6 +38,7 @@ class Look(NamedTuple):
     beside: tuple[Result, ...]  # of the photos that are sure
     asked_sha256: str  # digest of these
     focal: FocalLength | None = None  # as found so far, with what other photos of the camera say
+    series: tuple[Result, ...] = ()  # it and the photos taken with it, if they are to be localized together
 
 
 class Change(NamedTuple):
@@ -96,7 +99,7 @@ def revise(
         for num_answers, after in enumerate(ask(looks), 1):
             look = looks[num_answers - 1]
             if after.error is None:
-                is_news = look.first is None or (after.beside is not None and len(after.beside.photos) > 0)
+                is_news = look.first is None or names_of(after) not in ((), names_of(look.first))
                 change = Change(look.number, results[look.number], after, is_news)
                 results[look.number] = after
                 yield change
@@ -168,8 +171,9 @@ def list_looks_beside(results: Sequence[Result]) -> list[Look]:
     """List the photos that are not sure, each with others that are.
 
     These are the nearest in order: what was taken one after another mostly belongs together. A photo that was
-    looked at beside the same photos is done.
+    looked at beside the same photos, and has the same in its series, is done.
     """
+    series = {k: numbers for numbers in list_series(results) for k in numbers}
     sure = [
         k
         for k, result in enumerate(results)
@@ -182,14 +186,44 @@ def list_looks_beside(results: Sequence[Result]) -> list[Look]:
         place = bisect(sure, k)
         around = sure[max(place - MOST_PICTURES, 0) : place + MOST_PICTURES]
         near = [results[n] for n in sorted(sorted(around, key=lambda n: abs(n - k))[:MOST_PICTURES])]
-        asked = digest_of(near)
-        if asked != (result.beside.asked_sha256 if result.beside else digest_of([])):
-            first = None if result.beside and result.beside.photos else result
+        asked = digest_of([*near, *(results[n] for n in series.get(k, ()))])
+        if result.beside.asked_sha256 != asked if result.beside else near:
+            first = None if names_of(result) else result
             looks.append(Look(k, result.pano, first, tuple(near), asked, result.focal_length))
     return looks
 
 
-LISTINGS = (list_looks_by_focal, list_looks_beside)  # in their order
+def list_looks_together(results: Sequence[Result]) -> list[Look]:
+    """List the photos that are still not localized, each with those that were taken with it."""
+    looks = []
+    for numbers in list_series(results):
+        series = tuple(results[k] for k in numbers)
+        for k, result in zip(numbers, series, strict=True):
+            beside = result.beside or Beside((), digest_of(series))
+            if result.status in (AMBIGUOUS, NOT_LOCALIZED) and not beside.is_together:
+                looks.append(Look(k, result.pano, result, (), beside.asked_sha256, None, series))
+    return looks
+
+
+def follow(first: Result, found: Result) -> Result:
+    """Return what was found of a photo by others, with what it had alone.
+
+    Only what a photo says alone of its focal length counts for others.
+    """
+    focal = found.focal_length
+    if first.focal_length is not None:
+        focal = first.focal_length.update(focal)
+    elif focal is not None:
+        focal = replace(focal, picture_px=None, picture_std_px=None)
+    return replace(found, focal_length=focal, gps_prior=first.gps_prior)
+
+
+def names_of(result: Result) -> tuple[str, ...]:
+    """Return the names of the photos by which a result was found, too."""
+    return result.beside.photos if result.beside else ()
+
+
+LISTINGS = (list_looks_by_focal, list_looks_beside, list_looks_together)  # in their order
 
 
 def digest_of(results: Sequence[Result]) -> str:

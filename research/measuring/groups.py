@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from piccolo import CoarseToFineSettings, Photo
-from piccolo.arguments import MIN_CONFIDENCE
 from piccolo.camera.model import camera_of_fov
 from piccolo.cli.command import Arguments, option
 from piccolo.cloud.stream import stream_of_arrays
@@ -104,7 +103,7 @@ def localize_each(
     watch = Stopwatch()
     shots = [Shot(read_panorama(Photo(trial.rgb, focal_px=trial.focal_px)), settings) for trial in photos]
     alone, members = find_members(scan_map, shots, workers, watch)
-    linked = localize_linked(members, Means(settings.effort, workers, watch), MIN_CONFIDENCE)
+    linked = localize_linked(members, Means(settings.effort, workers, watch), settings.demand)
     for k, trial in enumerate(photos):
         yield "alone", trial, alone[k]
         yield "together", trial, linked[k].result if k in linked else alone[k]
