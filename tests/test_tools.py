@@ -188,6 +188,7 @@ def test_trials_of_a_scene_and_what_is_learnt_from_them(scene, tmp_path, capsys,
     assert re.search(r"constant -?\d+\.\d+, log10 of the largest deviation", text)
     assert "| probability, learnt from | answers | mean stated | fraction right |" in text
     assert "| covariance, others | right poses |" in text
+    assert re.search(r"\| clean \| 0\.25 \| 1 \| 0\.9\d \| 1\.00 \| 1 \| 0 \| \d+\.\d+ \| \d+\.\d+ \|", text)
     assert benchmark.main(["calibration", "--fit", str(tmp_path / "none.jsonl")]) == 3
     (tmp_path / "odd.jsonl").write_text("{}")
     assert benchmark.main(["calibration", "--check", str(tmp_path / "odd.jsonl")]) == 3

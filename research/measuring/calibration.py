@@ -15,7 +15,7 @@ from piccolo.arrays import Array
 from piccolo.cli.command import Arguments, option
 from piccolo.files.json_file import parse_lines, read_bytes
 from piccolo.geometry.nearness import RIGHT
-from piccolo.geometry.pose import MAX_DISTANCE
+from piccolo.geometry.pose import MAX_ANGLE, MAX_DISTANCE
 from piccolo.geometry.pose_gaussian import probability_of_ball, subtract
 from piccolo.judge import probability as confidence
 from piccolo.judge.belief import make_belief
@@ -32,11 +32,13 @@ example:
 
 The files are those of tools/benchmark.py confidence. Prints the fitted weights, to be copied to
 piccolo/judge/probability.py, and tables for each set of trials: how reliable the probabilities of the
-fitted model are (without --fit, of the model in use), and the fraction of true poses inside the confidence
-regions of the covariance.
+fitted model are (without --fit, of the model in use), the fraction of true poses inside the confidence
+regions of the covariance, and for each case how many poses are within 0.05 to 1 m, as told and so, with the
+chi squares a degree of freedom of those that are told with 0.9.
 """
 PENALTY = 0.05  # on squared weights of features of deviation 1: without, easy trials ask for ever larger ones
 TENTHS = [k / 10 for k in range(11)]
+ACCURACIES = (0.05, 0.1, 0.25, 1.0)  # [m] that users may need
 Case = tuple[str, str, bool]  # what was tried, the status, and whether the best pose is right
 
 
@@ -50,6 +52,7 @@ class Outcome(NamedTuple):
     right: int  # of the poses, or their number if none is
     is_refused: bool  # as mirrored: no choice was made
     error: Array  # (6,) of the best pose, as PoseCovariance has it; NaN without truth
+    sound: float  # probability, as told, that the best pose's place and what was given are right
 
     @property
     def evidence(self) -> EvidenceKind:
@@ -71,6 +74,17 @@ class Outcome(NamedTuple):
         places = confidence.posterior(self.standings, self.std_of_fit, model=model)[:-1]
         return make_belief(places, within).probabilities
 
+    def told_within(self, accuracy: float) -> float:
+        """Return the probability, as told, that the best pose is within an accuracy [m]."""
+        if self.covariance is None:
+            return 0.0
+        return self.sound * probability_of_ball(self.covariance.matrix[3:, 3:], accuracy)
+
+    def is_within(self, accuracy: float) -> bool:
+        """Return True if the best pose is within an accuracy [m], and turned as little as a right one."""
+        turn = float(np.linalg.norm(self.error[:3]))
+        return bool(np.linalg.norm(self.error[3:]) < accuracy and turn < MAX_ANGLE)
+
 
 def read_outcome(line: str) -> Outcome | None:
     """Read a line of tools/benchmark.py confidence; None if no pose was found."""
@@ -87,8 +101,16 @@ def read_outcome(line: str) -> Outcome | None:
         true_pose = pose_of(trial["truth"])
         error = subtract(true_pose, poses[0])
         right = next((k for k, pose in enumerate(poses) if RIGHT.holds(pose, true_pose)), right)
-    is_refused = trial["probabilities"][-1] == 1.0
-    return Outcome(str(trial["case"]), standings, covariance, trial["std_of_fit"], right, is_refused, error)
+    return Outcome(
+        case=str(trial["case"]),
+        standings=standings,
+        covariance=covariance,
+        std_of_fit=trial["std_of_fit"],
+        right=right,
+        is_refused=trial["probabilities"][-1] == 1.0,
+        error=error,
+        sound=trial["sound"],
+    )
 
 
 def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:
@@ -148,6 +170,36 @@ def print_coverage(title: str, outcomes: Sequence[Outcome]) -> None:
     print(Table("", columns, tuple(rows)).markdown())
 
 
+def print_accuracies(title: str, outcomes: Sequence[Outcome]) -> None:
+    """Print for each case and accuracy what was told and what is so, and chi squares a degree of freedom."""
+    rows = []
+    for case in dict.fromkeys(o.case for o in outcomes):
+        own = [o for o in outcomes if o.case == case]
+        for accuracy in ACCURACIES:
+            told = np.array([o.told_within(accuracy) for o in own])
+            holds = np.array([o.is_within(accuracy) for o in own])
+            is_sure = told >= MIN_CONFIDENCE
+            sure = [o for o, is_one in zip(own, is_sure, strict=True) if is_one]
+            shares = f"{told.mean():.2f}", f"{holds.mean():.2f}"
+            counts = str(is_sure.sum()), str((is_sure & ~holds).sum())
+            rows.append((case, f"{accuracy:g}", str(len(own)), *shares, *counts, *compute_chi_squares(sure)))
+    columns = "within [m]", "trials", "told", "is so", "told 0.9", "wrong", "chi2 position", "chi2 rotation"
+    print(Table("", (title, *columns), tuple(rows)).markdown())
+
+
+def compute_chi_squares(outcomes: Sequence[Outcome]) -> tuple[str, str]:
+    """Return the mean chi squares a degree of freedom of positions and of rotations, in words."""
+    found = []
+    for part in (slice(3, 6), slice(3)):
+        squares = [
+            o.error[part] @ np.linalg.solve(o.covariance.matrix[part, part], o.error[part]) / 3.0
+            for o in outcomes
+            if o.covariance is not None and np.isfinite(o.error).all()
+        ]
+        found.append(f"{np.mean(squares):.2f}" if squares else "")
+    return found[0], found[1]
+
+
 def add_arguments(parser: ArgumentParser) -> None:
     """Add all options."""
     option(parser, "--fit FILE ...", "trials to which the weights are fitted", default=[])
@@ -186,4 +238,5 @@ def run(arguments: Arguments) -> int:
         table = reliability_table(f"probability, {name}", all_stated, np.concatenate(right).tolist(), TENTHS)
         print(table.markdown())
         print_coverage(f"covariance, {name}", outcomes)
+        print_accuracies(f"accuracy, {name}", outcomes)
     return 0

@@ -25,9 +25,11 @@ from piccolo.scan_map.scan_map import ScanMap, prepare_map
 from ..scene import Scene, document_of_pose, read_scene
 from ..synthetic import world as worlds
 from ..synthetic.layout import PLAIN
+from ..synthetic.outdoors import PLACE_KINDS
 from ..synthetic.places import ALIKE_KINDS, CHANGED, make_alike
 from .calibration import Case, print_cases
 from .claims import Points, Trial, claim_trials
+from .outdoor_trials import outdoor_trials
 
 EPILOG = """\
 example:
@@ -35,9 +37,10 @@ example:
 
 A seed makes rooms, and places that look the same from several positions. Scenes are folders with cloud.ply,
 queries.json and images; each panorama is localized in each cloud. With --photos, photos of 55 to 90 degrees
-are cut out of the panoramas, processed as by other cameras, and localized in their place. A false answer is
-a pose with the status localized that is more than 0.1 m or 5 degrees off. Writes the trials as JSON lines
-for tools/benchmark.py calibration, and prints a table.
+are cut out of the panoramas, processed as by other cameras, and localized in their place. With --outdoors,
+seeds make yards, streets and church fronts instead, each scanned in two ways, with photos and panoramas
+taken there and photos of another. A false answer is a pose with the status localized that is more than 0.1 m
+or 5 degrees off. Writes the trials as JSON lines for tools/benchmark.py calibration, and prints a table.
 """
 WIDTH = 1024  # of the panoramas [px]
 POINTS_PER_ROOM = 120_000
@@ -194,14 +197,21 @@ def photo_trials(scene: Scene, others: Sequence[Scene], number: int) -> Iterator
     yield (cloud.points + cloud.origin_world, cloud.colors), trials
 
 
+def seed_trials(arguments: Arguments, seed: int, workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
+    """Return the clouds that a seed makes, each with its trials."""
+    if arguments.outdoors:
+        return outdoor_trials(seed, arguments.outdoors, workers)
+    rooms = room_trials(seed, workers)
+    if not arguments.claims:
+        return chain(rooms, alike_trials(seed, arguments.kinds, workers))
+    points, trials = next(rooms)
+    return claim_trials(points, trials[:2], np.random.default_rng([seed, 55]))
+
+
 def all_trials(arguments: Arguments, workers: Workers) -> Iterator[tuple[str, Points, list[Trial]]]:
     """Yield the name of a scene, its points, its trials."""
     for seed in range(*arguments.seeds):
-        rooms = list(room_trials(seed, workers))
-        if arguments.claims:
-            rooms = list(claim_trials(rooms[0][0], rooms[0][1][:2], np.random.default_rng([seed, 55])))
-        alike = () if arguments.claims else alike_trials(seed, arguments.kinds, workers)
-        for points, trials in chain(rooms, alike):
+        for points, trials in seed_trials(arguments, seed, workers):
             yield f"seed {seed}", points, trials
     scenes = [read_scene(folder) for folder in arguments.scenes]
     for scene in scenes:
@@ -236,6 +246,7 @@ def trial_line(scene: str, trial: Trial, found: Result) -> dict[str, object]:
         "truth": trial.true_pose and document_of_pose(trial.true_pose),
         "status": found.status,
         "probabilities": probabilities,
+        "sound": float(found.belief.sound_places[0]) if poses else 0.0,
         "poses": list(map(document_of_pose, poses)),
         "standings": [list(standing) for standing in found.standings],
         "covariance": found.covariance and found.covariance.matrix.tolist(),
@@ -251,6 +262,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--scenes FOLDER ...", "scenes with true poses", default=[])
     option(parser, "--photos N", "cut so many photos out of each panorama of the scenes", default=0)
     option(parser, "--claims", "try photos and scans that say something wrong of their own geometry instead")
+    text = "try photos and panoramas of places outdoors instead, scanned by stations, a car, stereo pictures"
+    option(parser, "--outdoors KIND ...", text, choices=PLACE_KINDS, default=[])
     option(parser, "--ignore-colors", "localize by the shape of the scans alone")
     option(parser, "--out FILE", "write a JSON line per trial", required=True)
     option(parser, "--threads N", "number of threads", default=num_cores())

@@ -15,6 +15,7 @@ WALL_THICKNESS = 0.1  # [m]
 LABEL_NAMES = (  # kinds of surfaces; a label is the place in this list, and 0 is nothing
     *("nothing", "floor", "ceiling", "wall", "picture", "window", "door"),
     *("rug", "table", "shelf", "sofa", "crate"),
+    *("facade", "tree", "car", "pole"),
 )
 Pair = tuple[float, float]
 DOOR_ROOM = 1.2  # left free before an open door [m]
@@ -101,7 +102,7 @@ class Door(NamedTuple):
 
 
 class Room(NamedTuple):
-    """A closed room full of boxes, z up."""
+    """A closed room full of boxes, or an open place; z up."""
 
     corner: Array  # (3,) least corner of the free space [m]
     size: Array  # (3,) [m]
@@ -109,6 +110,9 @@ class Room(NamedTuple):
     materials: Array  # (B, 9) pattern, scale [m], two colours (3) in [0, 1], seed
     light: Array  # (3,) position of the lamp [m], or (B, 3) of each box's
     labels: Int64s  # (B,) see LABEL_NAMES
+    sky: tuple[float, float, float] | None = (
+        None  # its colour in [0, 1] above an open place; then `light` is a sun
+    )
 
     def clearance(self, position: Array) -> float:
         """Distance [m] from `position` (3,) to the nearest surface; negative inside a box, unseen by rays."""

@@ -127,7 +127,10 @@ def shade(
     lights: Array,
     rgb: Array,
 ) -> None:
-    """Write the colour (N, 3) in [0, 1] of each hit, lit by its box's lamp; black where nothing is hit."""
+    """Write the colour (N, 3) in [0, 1] of each hit, lit by its box's lamp; black where nothing is hit.
+
+    `lights` (B, 4) are positions of the lamps, and by how much their light decays [1/m2].
+    """
     for n in range(len(directions)):
         rgb[n, :] = 0.0
         if hits[n] < 0:
@@ -152,7 +155,7 @@ def shade(
         lz = lights[b, 2] - z
         distance2 = lx * lx + ly * ly + lz * lz
         towards = abs((c * lx + s * ly) if axis == 0 else (c * ly - s * lx) if axis == 1 else lz)
-        lit = AMBIENT + LAMP * towards / math.sqrt(distance2) / (1.0 + LAMP_DECAY * distance2)
+        lit = AMBIENT + LAMP * towards / math.sqrt(distance2) / (1.0 + lights[b, 3] * distance2)
         for k in range(3):
             rgb[n, k] = min(1.0, lit * (m[2 + k] * (1.0 - fraction) + m[5 + k] * fraction))
 
@@ -176,13 +179,14 @@ def cast_rays(
 ) -> tuple[Array, Array, Int64s]:
     """Ranges (N,) [m], colours (N, 3) in [0, 1] and labels (N,) along unit world `directions` (N, 3).
 
-    Where nothing is hit the range is inf, the colour black and the label 0. Quickest where directions that
-    follow each other are near each other: what lies elsewhere is not asked.
+    Where nothing is hit the range is inf, the colour black or the sky's, and the label 0. Quickest where
+    directions that follow each other are near each other: what lies elsewhere is not asked.
     """
     ranges = np.empty(len(directions))
     rgb = np.empty((len(directions), 3))
     labels = np.zeros(len(directions), dtype=np.int64)
-    lights = np.broadcast_to(room.light, (len(room.boxes), 3))
+    lights = np.full((len(room.boxes), 4), LAMP_DECAY if room.sky is None else 0.0)
+    lights[:, :3] = room.light
 
     def run(lo: int) -> None:
         part = slice(lo, lo + CHUNK)
@@ -198,6 +202,8 @@ def cast_rays(
         hit_boxes(origin, rays, boxes, ranges[part], hits)
         shade(origin, rays, ranges[part], hits, boxes, materials, lights[ahead], rgb[part])
         is_hit = hits >= 0
+        if room.sky is not None:
+            rgb[part][~is_hit] = room.sky
         labels[part][is_hit] = room.labels[ahead[hits[is_hit] // 3]]
 
     list(workers.map(run, range(0, len(directions), CHUNK), label))
