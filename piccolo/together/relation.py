@@ -20,7 +20,7 @@ from ..local_features.matching import Matches
 NUM_WEAK = 2  # directions in which a pose is tried
 TRIED = (0.15, 0.3)  # [m] on both sides of it
 RANGE_OF_TURN = 3.0  # chosen: [m] by which a turn [rad] is compared with a move
-NUM_STEPS = 30  # of a descent
+STEPS_OF_RELATION = 30  # of a descent
 LEAST_MOVE = 0.05  # of a direction of unit length: others turn only
 
 
@@ -34,7 +34,7 @@ class Relation(NamedTuple):
 def relate(matches: Matches, near: Pose) -> Relation:
     """Return the best pose near one by matches, and its errors."""
     starts = [near, *(add(near, step) for step in list_weak_steps(matches, near))]
-    ends = [refine_on(matches, refine_on(matches, start, NUM_STEPS), NUM_STEPS) for start in starts]
+    ends = [refine_on(matches, refine_on(matches, start, STEPS_OF_RELATION), STEPS_OF_RELATION) for start in starts]
     losses = np.array([compute_match_loss(matches, end) for end in ends])
     best = ends[int(losses.argmin())]
     weights = np.exp(losses.min() - losses)

@@ -41,7 +41,7 @@ def take_photo(place: Place, index: int, workers: Workers) -> Photo:
     camera = camera_of_fov("pinhole", rng.uniform(*FOVS_DEG), *worlds.PHOTO_SIZE)
     pose = Pose(R_cam_from_world, position)
     rgb = worlds.render_picture(Mount(camera), place.room, pose, workers)
-    return Photo(worlds.change_sensor(rgb, rng), pose, camera.focal[0])
+    return Photo(worlds.change_sensor(rgb, rng, rng), pose, camera.focal[0])
 
 
 def take_panorama(place: Place, index: int, width: int, workers: Workers) -> Query:
@@ -49,4 +49,4 @@ def take_panorama(place: Place, index: int, width: int, workers: Workers) -> Que
     rng = np.random.default_rng([place.seed, 63, index])
     pose = Pose(yaw_rotation(rng.uniform(0.0, 2.0 * np.pi)), draw_position(place, rng, HEIGHTS))
     rgb = worlds.photograph(place.room, pose, width, workers)
-    return Query(worlds.change_sensor(rgb, rng), pose, place.kind)
+    return Query(worlds.change_sensor(rgb, rng, rng), pose, place.kind)
