@@ -12,6 +12,7 @@ from .belief import Belief, make_belief
 
 LEAST_NONE = 1e-6
 MISSED = 0.25  # chosen: of photos, those without a right pose found (of BENCHMARK.md's phone photos a sixth)
+IS_NEARBY = 0.8  # chosen: probability that a photo of a group was taken within reach of the others
 LOCAL_ERRORS = np.diag(np.repeat([math.radians(2.0) ** 2, 0.15**2], 3))  # chosen: of local optima, [rad, m]
 
 
@@ -55,6 +56,21 @@ def believe_together(
         within = alone.within
     left = min(1.0, (1.0 - place) / max(1.0 - float(bundles[0]), LEAST_NONE))
     return make_belief([place, *(left * bundles[1:-1])], within)
+
+
+def believe_nearby(near: Belief, alone: Belief, gain: float) -> Belief:
+    """Return the belief in a photo that was searched where others of its group were taken.
+
+    `near` is by its own picture, as if a whole scan had been searched, which is `gain` times as large. If it
+    was not taken with the others, its places are those of `alone`. That others tell the place says nothing of
+    local optima: without evidence of its own no photo is exact.
+    """
+    odds = np.array(near.place[:-1]) / max(near.place[-1], LEAST_NONE)
+    elsewhere = sum(alone.place[:-1]) / max(alone.place[-1], LEAST_NONE)
+    here = IS_NEARBY * gain * odds
+    rest = 1.0 + (1.0 - IS_NEARBY) * elsewhere
+    within = near.within * (1.0 - local_share(float(odds[0])))
+    return replace(make_belief(here / (here.sum() + rest), within, near.doubt), ruled_out=near.ruled_out)
 
 
 def believe_beside(alone: Belief, confidences: Sequence[float], within: float | None) -> Belief:

@@ -27,6 +27,7 @@ from .bundle import EVEN_ODDS, judge_placed, place_between, weigh_local
 from .bundle_search import NUM_BUNDLES, Support, find_support, weigh_bundles
 from .links import FIRM, WEAK, Links, Places, are_bridged, compute_shared, find_links, find_pose, spread
 from .members import Member, Shot, find_members
+from .nearby import localize_nearby
 
 NUM_ANCHORS = 2  # poses of a photo from which a place of the group may follow, the likeliest
 LEAST_LIKELY = 1e-3  # chosen: probability of such a pose
@@ -34,6 +35,7 @@ MOST_SPREAD = 12  # places of the group that are looked at
 BELONGS_WEAKLY = 0.7  # chosen: probability that a photo belongs where few matches put it
 MOST_SOURCES = 3  # photos by whose errors a photo is placed
 MOST_STD_OF_SOURCE = 0.1  # chosen: [m] deviation of the own pose of one by which others are placed
+LEAST_LOCATED = 2  # photos that tell where the others were taken
 NUM_LOCATED = 2  # rounds in which local optima are told from right poses
 UNCERTAIN = np.zeros((6, 6))
 
@@ -69,17 +71,36 @@ def localize_group(
     """
     contents = [sha256(shot.panorama.rgb.tobytes()).digest() for shot in shots]
     order = sorted(range(len(shots)), key=contents.__getitem__)  # results depend on no other
-    alone, members = find_members(scan_map, [shots[k] for k in order], workers, watch)
-    grouped = {order[k]: Grouped(one, ()) for k, one in enumerate(alone)}
+    sorted_shots = [shots[k] for k in order]
+    alone, members = find_members(scan_map, sorted_shots, workers, watch)
+    grouped = {k: Grouped(one, ()) for k, one in enumerate(alone)}
     matched = {k: one for k, one in members.items() if one.found.problem.profile.uses_matches}
     if matched:
         settings = shots[0].settings
         with watch.stage("refine"):
             means = Means(settings.effort, workers, watch)
-            found = localize_linked(matched, means, settings.demand)
-        for k, (result, others) in found.items():
-            grouped[order[k]] = Grouped(result, tuple(sorted(order[other] for other in others)))
-    return [grouped[k] for k in range(len(shots))]
+            grouped |= localize_linked(matched, means, settings.demand)
+            grouped |= localize_rest(scan_map, sorted_shots, {k: grouped[k] for k in matched}, means)
+    return [
+        Grouped(grouped[k].result, tuple(sorted(order[other] for other in grouped[k].others)))
+        for k in np.argsort(order)
+    ]
+
+
+def localize_rest(
+    scan_map: ScanMap, shots: Sequence[Shot], grouped: Mapping[int, Grouped], means: Means
+) -> dict[int, Grouped]:
+    """Return the results of those photos that are not sure, but are found where the others were taken."""
+    sure = {k: one.result for k, one in grouped.items() if one.result.status == LOCALIZED}
+    if len(sure) < LEAST_LOCATED:
+        return {}
+    located = [result.gaussian.pose for result in sure.values() if result.gaussian]
+    found = {
+        k: localize_nearby(scan_map, shots[k], one.result, located, means)
+        for k, one in grouped.items()
+        if k not in sure
+    }
+    return {k: Grouped(result, tuple(sure)) for k, result in found.items() if result}
 
 
 def localize_linked(members: Mapping[int, Member], means: Means, demand: Demand) -> dict[int, Grouped]:

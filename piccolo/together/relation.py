@@ -34,7 +34,10 @@ class Relation(NamedTuple):
 def relate(matches: Matches, near: Pose) -> Relation:
     """Return the best pose near one by matches, and its errors."""
     starts = [near, *(add(near, step) for step in list_weak_steps(matches, near))]
-    ends = [refine_on(matches, refine_on(matches, start, STEPS_OF_RELATION), STEPS_OF_RELATION) for start in starts]
+    ends = [
+        refine_on(matches, refine_on(matches, start, STEPS_OF_RELATION), STEPS_OF_RELATION)
+        for start in starts
+    ]
     losses = np.array([compute_match_loss(matches, end) for end in ends])
     best = ends[int(losses.argmin())]
     weights = np.exp(losses.min() - losses)

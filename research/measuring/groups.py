@@ -15,11 +15,12 @@ from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Stopwatch, Workers, num_cores
 from piccolo.judge.result import Result
+from piccolo.localization.localize import localize
 from piccolo.localization.means import Means
 from piccolo.panorama import read_panorama
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
-from piccolo.together.group import localize_linked
-from piccolo.together.members import Shot, find_members
+from piccolo.together.group import localize_group
+from piccolo.together.members import Shot
 
 from ..synthetic import handheld, layout, world as worlds
 from ..synthetic.places import ALIKE_KINDS, make_alike
@@ -102,11 +103,11 @@ def localize_each(
     settings = CoarseToFineSettings()
     watch = Stopwatch()
     shots = [Shot(read_panorama(Photo(trial.rgb, focal_px=trial.focal_px)), settings) for trial in photos]
-    alone, members = find_members(scan_map, shots, workers, watch)
-    linked = localize_linked(members, Means(settings.effort, workers, watch), settings.demand)
-    for k, trial in enumerate(photos):
-        yield "alone", trial, alone[k]
-        yield "together", trial, linked[k].result if k in linked else alone[k]
+    for k, shot in enumerate(shots):
+        alone = localize(scan_map, shot.panorama, settings, Means(settings.effort, workers, watch))
+        yield "alone", photos[k], alone
+    for trial, one in zip(photos, localize_group(scan_map, shots, workers, watch), strict=True):
+        yield "together", trial, one.result
 
 
 def add_arguments(parser: ArgumentParser) -> None:
