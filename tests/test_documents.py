@@ -27,7 +27,7 @@ from piccolo.opening import Cloud
 from piccolo.photo import Photo, Prior
 from research.synthetic import make_room
 
-TIER = "scene"
+TIER = "process"
 
 ROOT = Path(__file__).resolve().parents[1]
 NUMBER = r"-?\d+(?:\.\d+)?"
@@ -58,7 +58,6 @@ def _run_all(commands, folder, monkeypatch, capsys):
     return capsys.readouterr().out
 
 
-@pytest.mark.process
 def test_readme_python_prints_what_it_says():
     lines = re.search(r"^    import piccolo\n(?:    .*\n)+", README, flags=re.MULTILINE)[0]
     command = [sys.executable, "-c", textwrap.dedent(lines)]

@@ -25,7 +25,7 @@ from research.measuring import benchmark, confidence, page, sensitivity, speed
 from research.scene import Query, read_scene, write_queries
 from research.synthetic.world import cut_photo, write_photo
 
-TIER = "scene"
+TIER = "process"
 
 DAMAGE = "20% hidden by objects", "half of the sphere masked"
 TITLES = {name: text.splitlines()[0].removeprefix("## ") for name, text in page.PARTS.items()}
@@ -44,7 +44,6 @@ def table_of(page, title):
     return {cells[0]: dict(zip(head[1:], cells[1:], strict=True)) for cells in rows}
 
 
-@pytest.mark.process
 def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch):
     small = PaperSettings(num_translations=4, num_iterations=5, max_points=5000)
     monkeypatch.setattr(page, "PAPER_SETTINGS", small)
@@ -108,7 +107,6 @@ def test_sizes_are_those_asked_for(scene):
     assert (len(points), len(queries)) == (50_000, 1)
 
 
-@pytest.mark.process
 def test_parts_of_the_page_and_its_refusals(scene, tmp_path, capsys):
     assert benchmark.main(["all", "--scenes", str(scene), "--only", "kernels"]) == 0
     text = capsys.readouterr().out
@@ -226,7 +224,6 @@ def test_a_number_is_moved_by_a_fifth_and_a_whole_one_by_one_at_least():
     assert sensitivity.move(METHOD, "enough_matches", 1.2).enough_matches == 48
 
 
-@pytest.mark.process
 def test_fuzzing_runs_and_finds_nothing_at_once(tmp_path):
     words = ["scene.json", "-runs=20", f"-artifact_prefix={tmp_path}/"]
     done = run(command_of("tests/fuzz/fuzz_readers.py", *words))
