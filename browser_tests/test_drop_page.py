@@ -228,6 +228,27 @@ def test_a_phone_photo_without_focal_length_is_localized_once_its_field_is_told(
     assert page.evaluate("told") == {"photo": lens}
 
 
+def test_a_pose_that_is_not_exact_enough_is_accepted_by_who_says_so(visit):
+    page = visit()
+    page.click(".drop >> text=Options")
+    page.fill("[name=accuracy]", "0.001")
+    page.click(".options .main")
+    assert page.inner_text(".told span") == "Told of the next photos: exact enough is 0.001 m"
+    _choose(page, FLAT / "images" / "bedroom.jpg")
+    _wait(page, "not_localized")
+    facts = page.inner_text("#facts")
+    assert "the place is certain, the position only to 0.0" in facts
+    assert re.search(r"an accuracy of 0\.0\d+ m would accept it", facts)
+    assert page.locator('.confidence[title*="within 0.001 m and 5°"]').count() == 1
+    assert float(page.inner_text('.confidence:has-text("Place") b').rstrip(" %")) > 90.0
+    page.evaluate(LISTEN)
+    page.click('.copy:has-text("Say what is exact enough")')
+    page.fill("[name=accuracy]", "0.25")
+    page.click(".options .main")
+    _wait(page, "localized")
+    assert page.evaluate("told") == {"accuracy": {"metres": 0.25}}
+
+
 def test_a_place_is_shown_on_the_plan(visit):
     page = visit()
     page.click(".drop >> text=Options")

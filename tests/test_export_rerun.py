@@ -15,6 +15,7 @@ from piccolo.export import rerun_file
 from piccolo.export.formats import export
 from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, exp_so3, uniform_rotations
+from piccolo.judge.belief import make_belief
 from piccolo.judge.result_parts import Source
 
 ORIGIN = np.array([500_000.0, 5_400_000.0, 300.0])
@@ -58,7 +59,8 @@ def _photo(path):
 @pytest.mark.parametrize("width", [640, 400])
 def test_dots_of_a_photo_are_where_the_pinhole_that_is_read_back_projects_them(tmp_path, width, monkeypatch):
     monkeypatch.setattr(rerun_file, "MAX_RERUN_WIDTH", width)
-    photo = result(_photo(tmp_path / "a b.jpg"), POSE, cameras=(Mount(PHOTO),))
+    about = {"cameras": (Mount(PHOTO),), "belief": make_belief([0.95])}
+    photo = result(_photo(tmp_path / "a b.jpg"), POSE, **about)
     options = Options(images=tmp_path, offset=tuple(ORIGIN))
     assert export([photo], "rerun", tmp_path / "x.rrd", options) == {}
     found = read(tmp_path / "x.rrd")
@@ -66,6 +68,7 @@ def test_dots_of_a_photo_are_where_the_pinhole_that_is_read_back_projects_them(t
     frame = found[r"/photos/a\ b.jpg"]
     picture = found[r"/photos/a\ b.jpg/image"]
     assert (frame["confidence"], frame["status"], frame["timelines"]) == ([0.9], ["localized"], [])
+    assert frame["place_probability"] == [0.95]
     assert picture["Pinhole:resolution"] == [[width, width * 3 / 4]]
     blob = np.array(picture["EncodedImage:blob"][0], np.uint8)
     gray = cv2.imdecode(blob, cv2.IMREAD_GRAYSCALE).astype(float) - 60.0

@@ -280,7 +280,7 @@ export class Drop {
     const { refusal, result, state } = job;
     const isUnsure = result && photo.status !== "localized";
     const known = refusal?.needsField ? { fov: FOV, ...job.options } : job.options;
-    const advice = isUnsure ? words.notSure : refusal && adviceOn(refusal);
+    const advice = isUnsure ? (photo.hint ? words.lessExact : words.notSure) : refusal && adviceOn(refusal);
     const retry = (options: Options) => {
       job.options = options;
       job.tries = 0;
@@ -290,7 +290,7 @@ export class Drop {
       "div",
       { class: "copies" },
       isUnsure && hasPlace(job) ? action("search", words.everywhere, () => retry(this.withoutPlace(job.options)), "main") : null,
-      isUnsure || refusal?.needsField ? action("tune", words.tell, () => this.dialog.open(known, retry)) : null,
+      isUnsure || refusal?.needsField ? action("tune", photo.hint ? words.tellExact : words.tell, () => this.dialog.open(known, retry)) : null,
       state === "done" && refusal?.mayPass ? action("again", words.again, () => retry(job.options)) : null,
       action("close", words.remove, () => this.remove(job)),
     );

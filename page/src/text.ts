@@ -194,10 +194,11 @@ export const text = {
     title: "Where was it taken?",
     lead: (size: string) => `Drop photos anywhere on this page: 360° photos and phone photos, several at once, up to ${size} each.`,
     leadOfTouch: (size: string) => `Tap to choose 360° photos and phone photos, several at once, up to ${size} each.`,
-    toldOf: ({ fov, focal, x, y, radius }: Record<string, string>) => {
+    toldOf: ({ fov, focal, x, y, radius, accuracy }: Record<string, string>) => {
       const lens = focal ? `focal length ${focal} pixels` : fov ? `field of view ${fov}°` : "";
       const place = x && y ? `taken within ${radius || RADIUS} m of ${x}, ${y}` : "";
-      return [lens, place].filter(Boolean).join("; ");
+      const exact = accuracy ? `exact enough is ${accuracy} m` : "";
+      return [lens, place, exact].filter(Boolean).join("; ");
     },
     toldNext: (said: string) => `Told of the next photos: ${said}`,
     forget: "Clear",
@@ -248,7 +249,9 @@ export const text = {
     otherRemedy: "Try again; if that fails too, see what the service printed.",
     notSure:
       "If it is not a 360° photo, tell its field of view, which messengers remove from files. If you know about where it was taken, tell the place. If it shows somewhere else, nothing helps.",
+    lessExact: "If that is exact enough for you, say so.",
     tell: "Tell field of view or place",
+    tellExact: "Say what is exact enough",
     again: "Try again",
     remove: "Take off the list",
     options: "Options",

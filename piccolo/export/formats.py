@@ -47,7 +47,7 @@ from .reconstructions import (
 from .rerun_file import check_float32, write_rerun
 
 COLUMNS = (
-    *("image", "cloud", "status", "confidence", "score", "x", "y", "z"),
+    *("image", "cloud", "status", "confidence", "place_probability", "score", "x", "y", "z"),
     *("quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z"),  # of R_cam_from_world
     *("heading_deg", "pitch_deg", "roll_deg"),
 )
@@ -71,9 +71,10 @@ def write_csv(images: Sequence[PosedImage], out: Path, options: Options) -> None
         result = image.result
         pose = image.pose
         score = result.evidence.score if result.evidence else None
-        words = (cell(image.name), cell(result.cloud_name), result.status, result.confidence, score)
+        words = cell(image.name), cell(result.cloud_name), result.status
+        sure = result.confidence, result.place_probability, score
         wxyz = quaternion_wxyz(pose.R_cam_from_world).tolist()
-        table.writerow([*words, *pose.center_world.tolist(), *wxyz, *heading_pitch_roll_deg(pose)])
+        table.writerow([*words, *sure, *pose.center_world.tolist(), *wxyz, *heading_pitch_roll_deg(pose)])
     write_with_offset(out, text.getvalue(), options)
 
 
@@ -189,6 +190,7 @@ def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[s
         "cloud": result.cloud_name,
         "status": result.status,
         "confidence": result.confidence,
+        "place_probability": result.place_probability,
         "score": result.evidence and result.evidence.score,
         **{"crs": crs, "x": x, "y": y, "z": z},
         **{"heading_deg": heading, "heading_true_deg": true_heading % 360.0},

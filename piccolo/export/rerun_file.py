@@ -46,7 +46,12 @@ def write_rerun(images: Sequence[PosedImage], out: Path, options: Options) -> No
         is_timed = _set_time(recording, image, options)
         pose = turn_axes(image.pose, OPTICAL_FROM_CAM)
         transform = rr.Transform3D(translation=pose.center_world, mat3x3=pose.R_cam_from_world.T)
-        sure = rr.AnyValues(status=image.result.status, confidence=image.result.confidence)
+        result = image.result
+        sure = rr.AnyValues(
+            status=result.status,
+            confidence=result.confidence,
+            place_probability=result.place_probability,
+        )
         place = ["photos", *image.name.split("/")]
         recording.log(place, transform, rr.TransformAxes3D(SHOWN_AXES), sure, static=not is_timed)
         for part in _picture(rr, image, options):
