@@ -21,8 +21,8 @@ from ..problem.problem import Problem
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
 from .beside import recall_gaussian
-from .group import Grouped, localize_linked
-from .links import FIRM, match_each
+from .group import NUM_ANCHORS, Grouped, localize_linked
+from .links import FIRM, Placed, find_links, match_each, spread
 from .members import Member, Shot, check_photos, find_alone
 
 
@@ -41,8 +41,8 @@ def localize_among(
 ) -> dict[int, Grouped]:
     """Localize photos that are not sure with those whose pictures match theirs.
 
-    Returns those that are found by others, by their numbers. Photos that are linked with none that is not
-    sure cost no more than that is found out; no more than one of them is in memory.
+    Returns those that are found by others, by their numbers. A photo that is not sure is searched again if
+    others put it anywhere.
     """
     keypoints = {k: find_keypoints(scan_map, photo, workers, watch) for k, photo in enumerate(photos)}
     with watch.stage("match"):
@@ -50,11 +50,21 @@ def localize_among(
     if not numbers:
         return {}
     check_photos(len(numbers))
-    again = ((k, find_again(scan_map, photos[k], workers, watch)) for k in numbers)
-    members = {k: member for k, member in again if member is not None}
+    known = ((k, recall(scan_map, photos[k], workers, watch)) for k in numbers)
+    members = {k: member for k, member in known if member is not None}
+    with watch.stage("match"):
+        placed = list_placed(members, {k for k in members if photos[k].is_open}, workers)
+    if not placed:
+        return {}
     settings = photos[numbers[0]].settings
+    means = Means(settings.effort, workers, watch)
+    for k in [k for k in members if photos[k].is_open]:
+        member = search(scan_map, photos[k], means) if k in placed else None
+        if member is None:
+            del members[k]
+        else:
+            members[k] = member
     with watch.stage("refine"):
-        means = Means(settings.effort, workers, watch)
         found = localize_linked(members, means, settings.demand)
     return {k: one for k, one in found.items() if photos[k].is_open and one.others}
 
@@ -78,24 +88,41 @@ def list_asked(keypoints: Mapping[int, Keypoints | None], unsure: set[int], work
     return sorted({k for two in pairs if not unsure.isdisjoint(two) for k in two})
 
 
-def find_again(scan_map: ScanMap, photo: Known, workers: Workers, watch: Stopwatch) -> Member | None:
-    """Return a photo as it was found: by its result if it is sure, or else searched; None if it can't be."""
+def recall(scan_map: ScanMap, photo: Known, workers: Workers, watch: Stopwatch) -> Member | None:
+    """Return a photo as it was found, by its result; None if it is another, or nothing is known."""
+    panorama = photo.take()
+    result = photo.result
+    problem = panorama and prepare_search(scan_map, panorama, photo.settings, watch)
+    if not isinstance(problem, Problem) or result.best_pose is None:
+        return None
+    with watch.stage("refine"):
+        known = [result.best_pose, *(alternative.pose for alternative in result.alternatives)]
+        best, *others = [examine(problem, scan_map.from_world(pose)) for pose in known]
+        found = complete(problem, Selection(best, tuple(others)), workers)
+        errors = estimate_errors(problem, found.best, workers)
+        gaussian = recall_gaussian(problem, best.pose, result.covariance) or errors.gaussian
+        alone = replace(result, gaussian=gaussian, std_of_fit=errors.std_of_fit)
+        return Member(Found(problem, found, None).forget(), alone)
+
+
+def search(scan_map: ScanMap, photo: Known, means: Means) -> Member | None:
+    """Search a photo again by itself; None if it is another."""
     panorama = photo.take()
     if panorama is None:
         return None
-    if photo.is_open:
-        return find_alone(scan_map, Shot(panorama, photo.settings), workers, watch)
-    problem = prepare_search(scan_map, panorama, photo.settings, watch)
-    with watch.stage("refine"):
-        return None if problem is None else recall(problem, photo.result, workers)
+    return find_alone(scan_map, Shot(panorama, photo.settings), means.workers, means.watch)
 
 
-def recall(problem: Problem, result: Result, workers: Workers) -> Member:
-    """Return a photo that is sure as it was found, by its result."""
-    assert result.best_pose is not None
-    pose = problem.scan_map.from_world(result.best_pose)
-    found = complete(problem, Selection(examine(problem, pose), ()), workers)
-    errors = estimate_errors(problem, found.best, workers)
-    gaussian = recall_gaussian(problem, pose, result.covariance) or errors.gaussian
-    alone = replace(result, gaussian=gaussian, std_of_fit=errors.std_of_fit)
-    return Member(Found(problem, found, None).forget(), alone)
+def list_placed(members: Mapping[int, Member], unsure: set[int], workers: Workers) -> set[int]:
+    """List the photos that are not sure that follow from those that are, or from each other's own poses."""
+    links = find_links({k: member.found.problem for k, member in members.items()}, workers)
+
+    def place(number: int, rank: int = 0) -> Placed:
+        return links.place(number, members[number].own_poses[rank][0].pose)
+
+    placed = set(spread(links, {k: place(k) for k in members if k not in unsure}, members, FIRM)) & unsure
+    for k in sorted(unsure - placed):
+        for rank in range(min(len(members[k].own_poses), NUM_ANCHORS)):
+            found = spread(links, {k: place(k, rank)}, unsure, FIRM)
+            placed |= found.keys() if len(found) > 1 else set()
+    return placed
