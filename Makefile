@@ -1,5 +1,5 @@
 # make demo          set up, localize the photos of examples/flat, print the errors against the true poses, write a report
-# make test          set up, run the tests that start no processes
+# make test          set up, run the tests that start no processes, but those of research/
 # make test-all      set up, run every test but those of the report's page
 # make test-kernels  set up, run the numerical tests once without compiling and once with array bounds checked
 # make test-browser  set up, run the tests of the report's page in Chromium (apt-get install chromium npm)
@@ -31,7 +31,7 @@ demo: $(VENV)/ready
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 test: $(VENV)/ready
-	$(PYTEST) -m "not process"
+	$(PYTEST) -m "not process and not research"
 
 test-all: $(VENV)/ready
 	$(PYTEST)

@@ -12,6 +12,8 @@ from plyfile import PlyData, PlyElement
 from piccolo.cloud.writers import vertex_rows
 from research.scene import read_scene
 
+pytestmark = pytest.mark.research
+
 # 360loc
 SEQUENCES = ("daytime_360_1", "nighttime_360_2")
 

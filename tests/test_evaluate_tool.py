@@ -20,6 +20,8 @@ from research.evaluation import evaluate
 from research.evaluation.query_result import read_run
 from research.scene import Query, read_scene, write_queries
 
+pytestmark = pytest.mark.research
+
 TIER = "scene"
 
 QUICK = ["--quiet", "--preset", "paper", "max_points=20000", "num_translations=12", "num_iterations=30"]

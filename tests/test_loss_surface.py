@@ -19,6 +19,8 @@ from research.experiments import loss_surface as tool
 from research.experiments.loss_surface import LossSurface, PoseGrid, loss_surface
 from research.scene import read_scene
 
+pytestmark = pytest.mark.research
+
 STEP = 0.3
 
 

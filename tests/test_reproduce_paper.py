@@ -23,6 +23,8 @@ from research.experiments import reproduce_paper
 from research.experiments.reproduce_paper import EXPERIMENTS, conditions_of, flip, thin, with_random_rotation
 from research.scene import Query, read_scene, write_queries
 
+pytestmark = pytest.mark.research
+
 TIER = "scene"
 
 PRESETS = [PaperSettings(), CoarseToFineSettings()]

@@ -40,6 +40,8 @@ from research.synthetic.world import (
     scan_world,
 )
 
+pytestmark = pytest.mark.research
+
 SMALL = np.array([3.0, 3.0, 2.4])
 
 
