@@ -17,7 +17,7 @@ BIN := $(VENV)/bin
 $(VENV)/ready: requirements.lock requirements-formats.lock requirements-gps.lock requirements-plans.lock requirements-colmap.lock requirements-serve.lock requirements-rerun.lock requirements-cluster.lock requirements-video.lock requirements-dev.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "found $$($(PYTHON) --version), wanted Python 3.11 or newer: make PYTHON=python3.11" >&2; exit 1; }
 	@$(PYTHON) -m venv $(VENV) || { echo "no virtual environment could be made; on Debian: apt-get install python3-venv" >&2; rm -rf $(VENV); exit 1; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock -r requirements-formats.lock -r requirements-gps.lock -r requirements-plans.lock -r requirements-colmap.lock -r requirements-serve.lock -r requirements-rerun.lock -r requirements-cluster.lock -r requirements-video.lock -r requirements-dev.lock
+	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -r requirements.lock -r requirements-formats.lock -r requirements-gps.lock -r requirements-plans.lock -r requirements-colmap.lock -r requirements-serve.lock -r requirements-rerun.lock -r requirements-cluster.lock -r requirements-video.lock -r requirements-dev.lock
 	@touch $@
 
 demo: $(VENV)/ready
@@ -55,7 +55,7 @@ test-browser: $(VENV)/browser page/node_modules/ready
 	$(BIN)/python -m pytest browser_tests
 
 $(VENV)/browser: $(VENV)/ready requirements-browser.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-browser.lock
+	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -r requirements-browser.lock
 	@touch $@
 
 page/node_modules/ready: page/package-lock.json
