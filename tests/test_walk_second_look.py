@@ -113,7 +113,8 @@ def test_rough_places_are_refined_if_they_leave_another_unsure(probabilities, is
 
 
 def test_frames_that_are_not_sure_are_searched_some_of_each_run():
-    sure, unsure = Ranked([State(_at(0.0), 8.0, 0.5)], np.array([0.99])), NOTHING
+    sure = Ranked([State(_at(0.0), 8.0, 0.5)], np.array([0.99]))
+    unsure = NOTHING
     frames = [Frame(float(k)) for k in range(60)]
     beliefs = [unsure] * 2 + [sure] + [unsure] * 57
     assert second_look.list_unsure(frames, beliefs, 0.9) == [0, 1, *range(5, 60, 5)]
