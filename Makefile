@@ -1,5 +1,5 @@
 # make demo          set up, localize the photos of examples/flat, print the errors against the true poses, write a report
-# make test          set up, run the tests that start no processes
+# make test          set up, run the tests that start no processes, but those of research/
 # make test-all      set up, run every test but those of the report's page
 # make test-kernels  set up, run the numerical tests once without compiling and once with array bounds checked
 # make test-browser  set up, run the tests of the report's page in Chromium (apt-get install chromium npm)
@@ -17,7 +17,7 @@ BIN := $(VENV)/bin
 $(VENV)/ready: requirements.lock requirements-formats.lock requirements-gps.lock requirements-plans.lock requirements-colmap.lock requirements-serve.lock requirements-rerun.lock requirements-cluster.lock requirements-video.lock requirements-dev.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "found $$($(PYTHON) --version), wanted Python 3.11 or newer: make PYTHON=python3.11" >&2; exit 1; }
 	@$(PYTHON) -m venv $(VENV) || { echo "no virtual environment could be made; on Debian: apt-get install python3-venv" >&2; rm -rf $(VENV); exit 1; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock -r requirements-formats.lock -r requirements-gps.lock -r requirements-plans.lock -r requirements-colmap.lock -r requirements-serve.lock -r requirements-rerun.lock -r requirements-cluster.lock -r requirements-video.lock -r requirements-dev.lock
+	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -r requirements.lock -r requirements-formats.lock -r requirements-gps.lock -r requirements-plans.lock -r requirements-colmap.lock -r requirements-serve.lock -r requirements-rerun.lock -r requirements-cluster.lock -r requirements-video.lock -r requirements-dev.lock
 	@touch $@
 
 demo: $(VENV)/ready
@@ -31,7 +31,7 @@ demo: $(VENV)/ready
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 test: $(VENV)/ready
-	$(PYTEST) -m "not process"
+	$(PYTEST) -m "not process and not research"
 
 test-all: $(VENV)/ready
 	$(PYTEST)
@@ -55,7 +55,7 @@ test-browser: $(VENV)/browser page/node_modules/ready
 	$(BIN)/python -m pytest browser_tests
 
 $(VENV)/browser: $(VENV)/ready requirements-browser.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-browser.lock
+	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -r requirements-browser.lock
 	@touch $@
 
 page/node_modules/ready: page/package-lock.json

@@ -32,7 +32,8 @@ def rays(axes, width=WIDTH):
     longitude = ((np.arange(width) + 0.5) / width - 0.5) * 2 * np.pi
     latitude = (0.5 - (np.arange(width // 2) + 0.5) / (width // 2)) * np.pi
     longitude, latitude = np.meshgrid(longitude, latitude)
-    right, up = np.sin(longitude) * np.cos(latitude), np.sin(latitude)
+    right = np.sin(longitude) * np.cos(latitude)
+    up = np.sin(latitude)
     forward = np.cos(longitude) * np.cos(latitude)
     of = {OPTICAL: (right, -up, forward), OPENGL: (right, up, -forward)}
     of[FORWARD_LEFT_UP] = (forward, -right, up)
@@ -107,7 +108,8 @@ def assert_fits(folder, max_loss=0.13):
     for query in scene.queries:
         panorama = read_panorama(query.image)
         texels = pack_texels(panorama.rgb, panorama.is_valid)
-        R, center = query.pose.R_cam_from_world, query.pose.center_world - origin
+        R = query.pose.R_cam_from_world
+        center = query.pose.center_world - origin
         seen = visible_points(packed, center)
         loss, wrong = (sampling_loss(seen, texels, Pose(turn, center)) for turn in (R, R.T))
         assert loss < max_loss

@@ -27,10 +27,12 @@ def check_golden_poses(name, map_arrays, localize):
 
     map_arrays(seed) are the arrays of the prepared map.
     """
-    is_remade, entries = "REMAKE_GOLDEN" in os.environ, json.loads((FOLDER / name).read_text())
+    is_remade = "REMAKE_GOLDEN" in os.environ
+    entries = json.loads((FOLDER / name).read_text())
     for entry in entries:
         seed, variant = entry["seed"], entry["variant"]
-        cloud, rgb = room(seed)[1], query(seed, variant).rgb
+        cloud = room(seed)[1]
+        rgb = query(seed, variant).rgb
         arrays = {"cloud": (cloud.points, cloud.colors), "panorama": (rgb,), "map": map_arrays(seed)}
         hashes = {word: _digest(*values) for word, values in arrays.items()}
         changed = [word for word in hashes if entry["hashes"][word] != hashes[word]]

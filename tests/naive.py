@@ -18,8 +18,10 @@ def sample(image, pixels):
     """Bilinear values (N, C) of an image (H, W, C) at continuous pixels (N, 2): columns wrap, rows clamp."""
     height, width = image.shape[:2]
     u, v = pixels[:, 0] - 0.5, pixels[:, 1] - 0.5
-    j, i = np.floor(u).astype(int), np.floor(v).astype(int)
-    fu, fv = (u - j)[:, None], (v - i)[:, None]
+    j = np.floor(u).astype(int)
+    i = np.floor(v).astype(int)
+    fu = (u - j)[:, None]
+    fv = (v - i)[:, None]
 
     def at(row, column):
         return image[np.clip(row, 0, height - 1), column % width].astype(np.float64)
@@ -83,9 +85,12 @@ def nearest_box(origin, directions, boxes):
     """Range (N,) of the first of the boxes (B, 7) along each direction (N, 3): by planes, not by slabs."""
     best = np.full(len(directions), np.inf)
     for x, y, z, hx, hy, hz, yaw in boxes:
-        c, s = math.cos(yaw), math.sin(yaw)
+        c = math.cos(yaw)
+        s = math.sin(yaw)
         to_box = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        start, rays, half = to_box @ (origin - [x, y, z]), directions @ to_box.T, np.array([hx, hy, hz])
+        start = to_box @ (origin - [x, y, z])
+        rays = directions @ to_box.T
+        half = np.array([hx, hy, hz])
         for axis in range(3):
             for side in (-1.0, 1.0):
                 with np.errstate(divide="ignore"):
@@ -134,7 +139,8 @@ def normalized_cells(rgb, is_seen, num_rings, stats_rings, sigma_deg):
 
 def between_cells(directions, coarse_rings, values):
     """Values of a grid's cells (M, 3) at directions (N, 3): linear along each ring, then between two."""
-    grid, found = make_grid(coarse_rings), []
+    grid = make_grid(coarse_rings)
+    found = []
     for x, y, z in directions.astype(float):
         place = (math.pi / 2 - math.asin(max(-1.0, min(1.0, z)))) / math.pi * coarse_rings - 0.5
         along = []
@@ -219,7 +225,9 @@ def block_correlation(first, second, shared, blocks, num_blocks):
     """Correlation and area (blocks,) of channels (3, N) over weights (N,)."""
     correlation, area = np.zeros(num_blocks), np.zeros(num_blocks)
     for b in range(num_blocks):
-        w, x, y = shared[blocks == b], first[:, blocks == b], second[:, blocks == b]
+        w = shared[blocks == b]
+        x = first[:, blocks == b]
+        y = second[:, blocks == b]
         area[b] = w.sum()
         energy = (w * x**2).sum() * (w * y**2).sum()
         correlation[b] = (w * x * y).sum() / math.sqrt(energy) if energy > 1e-12 else 0.0

@@ -157,7 +157,8 @@ def write_photo(path, rgb, position=None, accuracy=None, time=None):
         for value, (number, reference, letters) in zip(position, tags, strict=True):
             degrees, rest = divmod(abs(value), 1.0)
             minutes, rest = divmod(rest * 60.0, 1.0)
-            gps[number], gps[reference] = (degrees, minutes, rest * 60.0), letters[value < 0]
+            gps[number] = (degrees, minutes, rest * 60.0)
+            gps[reference] = letters[value < 0]
         if accuracy is not None:
             gps[GPS.GPSHPositioningError] = accuracy
     if time is not None:

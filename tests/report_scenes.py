@@ -35,7 +35,8 @@ class House:
     """Two worlds, one above the other: the cloud of both, and photos with the poses they were taken at."""
 
     def __init__(self, folder, width=256):
-        self.folder, self.width = Path(folder), width
+        self.folder = Path(folder)
+        self.width = width
         self.worlds = [make_world(seed, SIZE, NUM_ROOMS) for seed in (11, 12)]
         self.cloud = self.folder / "house.npz"
         self.results = []
@@ -63,8 +64,10 @@ class House:
 
     def add_walk(self, num_frames):
         """Frames of a walk through a room of the lower storey; returns their lines."""
-        room, start = self.worlds[0].rooms[0], self.pose(0)[2]
-        middle, lines = room.corner + room.size / 2, []
+        room = self.worlds[0].rooms[0]
+        start = self.pose(0)[2]
+        middle = room.corner + room.size / 2
+        lines = []
         for k in range(num_frames):
             at = middle + np.array([0.9 * np.cos(0.5 * k), 0.6 * np.sin(0.5 * k), 0.0])
             at[2] = start.center_world[2]

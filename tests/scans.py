@@ -32,7 +32,8 @@ def write_scan(path, points, dtype="<f4", **options):
         rows[name] = points[:, k]
     for k, name in enumerate(("red", "green", "blue")):
         rows[name] = colors[:, k]
-    rows["nz"], rows["label"] = 1.0, np.arange(len(points)) - 7
+    rows["nz"] = 1.0
+    rows["label"] = np.arange(len(points)) - 7
     rows["scalar_intensity"] = np.linspace(0.0, 1.0, len(points))
     options = {"text": False, "byte_order": "<", "comments": ["made by hand"], **options}
     PlyData([PlyElement.describe(rows, "vertex")], **options).write(path)
@@ -54,7 +55,9 @@ def points_of(path):
 
 def bare_room():
     """Points (N, 3) of a closed box with nothing in it."""
-    rng, size, faces = np.random.default_rng(7), np.array([5.0, 4.0, 2.6]), []
+    rng = np.random.default_rng(7)
+    size = np.array([5.0, 4.0, 2.6])
+    faces = []
     for axis, side in np.ndindex(3, 2):
         face = rng.uniform(0.0, 1.0, (3000, 3)) * size
         face[:, axis] = side * size[axis]

@@ -214,7 +214,8 @@ def test_scanners_tell_up_in_a_bare_room(run, tmp_path):
     R = exp_so3(TURN)
     points = bare_room() @ R.T
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[3, :3] = R.T, R @ [2.0, 2.0, 1.5]
+    matrix[:3, :3] = R.T
+    matrix[3, :3] = R @ [2.0, 2.0, 1.5]
     path = write_lines(tmp_path / "a.ptx", ptx_lines(points, np.full(points.shape, 128), matrix))
     code, report, _ = run("--cloud", path, FREE)
     assert (code, report["explanation"]) == (0, "the scanners stood upright")

@@ -64,11 +64,13 @@ def test_permissions_follow_the_umask_or_the_file_that_is_replaced(tmp_path):
 
 @pytest.mark.parametrize("is_allowed", [True, False])
 def test_the_owner_stays_where_that_is_allowed(tmp_path, monkeypatch, is_allowed):
-    path, given = tmp_path / "a", []
+    path = tmp_path / "a"
+    given = []
     path.touch()
     if os.getuid() == 0:  # who alone may give files away
         os.chown(path, 1234, 1235)
-    owner, fchown = (path.stat().st_uid, path.stat().st_gid), os.fchown
+    owner = (path.stat().st_uid, path.stat().st_gid)
+    fchown = os.fchown
 
     def give(handle, uid, gid):
         given.append((uid, gid))
@@ -108,7 +110,8 @@ def test_a_link_stays_and_its_target_is_replaced(tmp_path, is_there):
 
 
 def test_a_fifo_is_written_to_and_stays(tmp_path):
-    fifo, read = tmp_path / "fifo.json", []
+    fifo = tmp_path / "fifo.json"
+    read = []
     os.mkfifo(fifo)
     reader = threading.Thread(target=lambda: read.append(fifo.read_bytes()))
     reader.start()

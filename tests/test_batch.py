@@ -37,7 +37,8 @@ def images(scene):
 @pytest.fixture
 def counted(monkeypatch):
     """The panoramas that are localized, in order."""
-    names, answer = [], module.Localizer.answer
+    names = []
+    answer = module.Localizer.answer
 
     def counting(self, *given):
         path = given[-1].photo.path
@@ -49,7 +50,8 @@ def counted(monkeypatch):
 
 
 def _run(scene, out, *more, pano=None):
-    cloud, panos = str(scene / "cloud.ply"), pano or [str(scene / "images")]
+    cloud = str(scene / "cloud.ply")
+    panos = pano or [str(scene / "images")]
     cache = str(scene.parent / "maps")
     return localize.main(["--cloud", cloud, "--pano", *panos, "--out", str(out), "--cache", cache, *more])
 
@@ -184,7 +186,8 @@ def test_photos_added_removed_or_changed_cost_only_their_own_lines(
             (photos / name).write_bytes(content)
         counted.clear()
         assert _run(scene, out, *PAPER, pano=[*panos] or [str(photos)]) < 2
-        done, err = list(counted), capsys.readouterr().err
+        done = list(counted)
+        err = capsys.readouterr().err
         assert _run(scene, whole, *PAPER, "--overwrite", "--quiet", pano=[*panos] or [str(photos)]) < 2
         assert _lines(out) == _lines(whole)
         return done, err
@@ -259,7 +262,8 @@ def test_what_the_system_did_to_a_photo_is_tried_again(scene, out, counted, monk
 
 def test_a_photo_is_read_once_so_that_its_digest_is_of_its_pixels(scene, tmp_path, out, images, monkeypatch):
     photo = tmp_path / "a.jpg"
-    read, reads = Path.read_bytes, []
+    read = Path.read_bytes
+    reads = []
 
     def read_and_replaced(path):
         content = read(path)

@@ -180,7 +180,9 @@ def _sure_by(confidence):
 @pytest.fixture
 def looked(monkeypatch):
     """What is looked at again; b and d are not sure before, and d is not after."""
-    ask, known, looked = Scan.localize_photo, {}, Looked([], {})
+    ask = Scan.localize_photo
+    known = {}
+    looked = Looked([], {})
 
     def localize(self, asked, *more, **noted):
         photo = asked.photo
@@ -207,7 +209,8 @@ def looked(monkeypatch):
 
 
 def _run(scene, photos, *more):
-    cloud, cache = str(scene / "cloud.ply"), scene.parent / "maps"
+    cloud = str(scene / "cloud.ply")
+    cache = scene.parent / "maps"
     return localize.main(["--cloud", cloud, "--pano", str(photos), "--cache", str(cache), *map(str, more)])
 
 

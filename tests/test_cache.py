@@ -130,7 +130,8 @@ def test_what_a_killed_process_was_writing_has_a_name_of_ours(tmp_path, ending):
 
 def test_only_stale_files_of_ours_go_and_only_from_a_folder_that_is_marked(tmp_path):
     """Not the user's own, not a link, not a fresh one; what a killed process was writing goes too."""
-    folder, key = tmp_path / "new", 32 * "0"
+    folder = tmp_path / "new"
+    key = 32 * "0"
     cache.own_folder(folder, jit.NAME)
     tag = (folder / "CACHEDIR.TAG").read_bytes()
     assert tag.startswith(b"Signature: 8a477f597d28d172789f06886806bc55\n")

@@ -59,7 +59,8 @@ def optical(rays):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_pixel_to_ray_to_pixel(model):
-    this, pixels = camera(model), points()
+    this = camera(model)
+    pixels = points()
     rays, is_seen = this.rays(pixels)
     assert is_seen.mean() > 0.9
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=1e-12)
@@ -71,7 +72,8 @@ def test_pixel_to_ray_to_pixel(model):
 @pytest.mark.parametrize("model", [model for model in MODELS if model != CUT_SPHERE])
 def test_pixels_are_those_of_colmap(model):
     theirs = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=PARAMS[model])
-    this, pixels = camera(model), points()
+    this = camera(model)
+    pixels = points()
     rays, is_seen = this.rays(pixels)
     is_ahead = is_seen & ((rays[:, 0] > 0.0) | (model == "EQUIRECTANGULAR"))
     found = theirs.img_from_cam(optical(rays[is_ahead]))
@@ -88,7 +90,8 @@ def test_pixels_are_those_of_colmap(model):
 def test_pixels_are_those_of_opencv_up_to_half_a_pixel(model):
     fx, fy, cx, cy, *more = map(float, PARAMS[model])
     matrix = np.array([[fx, 0.0, cx - 0.5], [0.0, fy, cy - 0.5], [0.0, 0.0, 1.0]])
-    this, pixels = camera(model), points()
+    this = camera(model)
+    pixels = points()
     rays, is_seen = this.rays(pixels)
     chosen = is_seen & (rays[:, 0] > 0.02)
     project = cv2.fisheye.projectPoints if model == "OPENCV_FISHEYE" else cv2.projectPoints
@@ -100,7 +103,8 @@ def test_pixels_are_those_of_opencv_up_to_half_a_pixel(model):
 def test_a_fisheye_sees_behind_itself_as_its_formula_says():
     this = camera("OPENCV_FISHEYE")
     fx, fy, cx, cy, k1, k2, k3, k4 = PARAMS["OPENCV_FISHEYE"]
-    theta, phi = np.radians(105.0), 0.7
+    theta = np.radians(105.0)
+    phi = 0.7
     ray = [np.cos(theta), -np.sin(theta) * np.cos(phi), -np.sin(theta) * np.sin(phi)]
     r = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8)
     found, _ = this.pixels(np.array(ray))
@@ -197,7 +201,8 @@ LENSES = {
 
 @functools.lru_cache
 def place():
-    world, workers = room(5)[0], Workers(2)
+    world = room(5)[0]
+    workers = Workers(2)
     pose = make_query(world, 0, "tilt", 128, workers).pose
     this, _, _ = pose_of_query(world, 0, "tilt")
     return this, pose, photograph(this, pose, 2048, workers)

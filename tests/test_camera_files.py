@@ -104,7 +104,8 @@ def test_our_own_json_comes_back(tmp_path):
 
 def test_rig_config_of_colmap(tmp_path):
     """x_cam = R x_rig + t in axes right, down, forward; its reference camera is our frame."""
-    wxyz, t = quaternion_wxyz(TURN), np.array([0.05, -0.02, 0.01])
+    wxyz = quaternion_wxyz(TURN)
+    t = np.array([0.05, -0.02, 0.01])
     cameras = [
         {"image_prefix": "rig1/a/", "ref_sensor": True},
         {

@@ -57,7 +57,8 @@ def test_views_are_made_once_whatever_is_asked_for():
 def test_no_more_than_so_many_are_kept_and_those_given_out_stay():
     m, _ = _views()
     kept = CandidateViews(m.octree, m.centers, most_kept=40)
-    rng, given = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    given = []
     for count in (30, 30, 5, 60, 60, 10):
         candidates = rng.choice(len(m.centers), count, replace=False)
         given.append((candidates, *kept.at(candidates, Workers(1))))
@@ -86,7 +87,8 @@ def test_threads_may_ask_at_once():
 def test_wide_views_are_averages_of_fine_ones():
     m, _ = _views()
     centers = m.centers[m.sparse]
-    fine, (cells, areas) = render_views(m.octree, centers, SEARCH_VIEW, Workers(2)), wider_cells(12)
+    fine = render_views(m.octree, centers, SEARCH_VIEW, Workers(2))
+    (cells, areas) = wider_cells(12)
     matrix = np.eye(len(areas))[cells] * whole_areas(24)[:, None]
     expected = fine.features.astype(np.float64) @ matrix / matrix.sum(axis=0)
     found = m.wide_features.reshape(expected.shape).astype(np.float64)

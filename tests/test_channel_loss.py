@@ -37,7 +37,8 @@ def _loss(problem, pose):
 
 def _sums(problem, pose, is_valid=None):
     points, levels, weights, rgb = problem
-    sums, texels = np.empty(NUM_SUMS), pack_texels(rgb, is_valid)
+    sums = np.empty(NUM_SUMS)
+    texels = pack_texels(rgb, is_valid)
     arguments = channel_loss.ChannelProblem(points, levels, weights, texels.rgbx, texels.width, SCALE)
     channel_loss.channel_equations(arguments, pose.R_cam_from_world, pose.center_world, sums)
     return sums
@@ -147,7 +148,9 @@ def _score(shown, levels, weights, blocks):
     """Score by NumPy: covariances of each block around its weighted means."""
     total = 0.0
     for block in np.unique(blocks[weights > 0]):
-        w, a, b = weights[blocks == block], levels[:, blocks == block], shown[:, blocks == block]
+        w = weights[blocks == block]
+        a = levels[:, blocks == block]
+        b = shown[:, blocks == block]
         a = a - np.average(a, axis=1, weights=w)[:, None]
         b = b - np.average(b, axis=1, weights=w)[:, None]
         variances = [max((w * x * x).sum() / w.sum(), channel_loss.FLAT_BLOCK**2) for x in (a, b)]
@@ -163,7 +166,9 @@ def _score(shown, levels, weights, blocks):
 def test_solver_equals_numpy_and_refuses_a_singular_matrix():
     rng = np.random.default_rng(0)
     J = rng.normal(size=(20, 6))
-    A, g, delta = J.T @ J, rng.normal(size=6), np.empty(6)
+    A = J.T @ J
+    g = rng.normal(size=6)
+    delta = np.empty(6)
     assert solve_damped(np.concatenate([[0.0, 0.0], g, A[np.triu_indices(6)]]), 0.1, delta)
     np.testing.assert_allclose(delta, np.linalg.solve(A + 0.1 * np.diag(np.diag(A)), -g), rtol=1e-6)
     assert not solve_damped(np.concatenate([[0.0, 0.0], g, -A[np.triu_indices(6)]]), 0.0, delta)
@@ -184,17 +189,20 @@ def test_step_is_limited_and_otherwise_that_of_the_pose():
 
 def test_descent_arrives_and_takes_no_step_up():
     """A bowl about (1, 2, 3) with a wall around a point on the way, where the loss is 100."""
-    goal, losses = np.array([1.0, 2.0, 3.0]), []
+    goal = np.array([1.0, 2.0, 3.0])
+    losses = []
 
     def equations(problem, R, t, sums):
         e = R @ (t - goal)
         is_wall = np.linalg.norm(t - problem) < 0.1
-        sums[LOSS], sums[GRADIENT:MATRIX] = 100.0 if is_wall else 0.5 * e @ e, [0, 0, 0, *e]
+        sums[LOSS] = 100.0 if is_wall else 0.5 * e @ e
+        sums[GRADIENT:MATRIX] = [0, 0, 0, *e]
         sums[MATRIX:] = np.diag([1.0] * 6)[np.triu_indices(6)]
         losses.append(sums[LOSS])
 
     for num_iterations, most in ((3, 7.0), (100, 1e-9)):
-        R, t = np.eye(3), np.zeros(3)
+        R = np.eye(3)
+        t = np.zeros(3)
         loss = levenberg_marquardt(equations)(0.3 * goal / np.linalg.norm(goal), num_iterations, 1e-7, R, t)
         assert loss == pytest.approx(0.5 * (t - goal) @ (t - goal))
         assert loss <= most
@@ -209,7 +217,8 @@ def test_a_start_without_a_loss_takes_no_step():
         sums[:] = np.nan
         calls.append(t.copy())
 
-    R, t = np.eye(3), np.ones(3)
+    R = np.eye(3)
+    t = np.ones(3)
     assert levenberg_marquardt(equations)(None, 9, 1e-7, R, t) == math.inf
     np.testing.assert_array_equal(calls, [np.ones(3)])
     np.testing.assert_array_equal(R, np.eye(3))

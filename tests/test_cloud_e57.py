@@ -72,7 +72,8 @@ def test_scanners_with_a_pose_tell_their_z_axis(tmp_path):
 def test_spherical_coordinates_single_precision_and_scaled_integers(tmp_path):
     distance = np.linalg.norm(RAW.points_world, axis=1)
     x, y, z = RAW.points_world.T
-    azimuth, elevation = np.arctan2(y, x), np.arcsin(z / distance)
+    azimuth = np.arctan2(y, x)
+    elevation = np.arcsin(z / distance)
     spherical = {"sphericalRange": distance, "sphericalAzimuth": azimuth, "sphericalElevation": elevation}
     written = ScanToWrite(spherical | colored(), BYTES, None, QUATERNION)
     points, _ = read(write(tmp_path / "a.e57", [written]))
@@ -186,7 +187,8 @@ def with_header(content, position, value):
     return sealed(content[:position] + value.to_bytes(8, "little") + content[position + 8 :])
 
 
-CUT, LONG = "the file is cut off or broken", 1 << 40
+CUT = "the file is cut off or broken"
+LONG = 1 << 40
 
 
 @pytest.mark.parametrize(
@@ -281,7 +283,8 @@ def test_mutated_files_raise_nothing_but_input_error(tmp_path_factory, data, is_
 
 SPHERE = {"imageWidth": 400, "imageHeight": 200, "pixelWidth": np.pi / 200, "pixelHeight": np.pi / 200}
 SMALL = {"imageWidth": 30, "imageHeight": 20}
-JPEG, PNG = b"\xff\xd8\xff and a picture" * 90, b"\x89PNG\r\n\x1a\n and a picture"
+JPEG = b"\xff\xd8\xff and a picture" * 90
+PNG = b"\x89PNG\r\n\x1a\n and a picture"
 IMAGES = [
     ImageToWrite(JPEG, "sphericalRepresentation", "jpegImage", SPHERE, name="pano", scan_guid="{scan}"),
     ImageToWrite(PNG, "pinholeRepresentation", "pngImage", SMALL, QUATERNION, tuple(CENTER)),

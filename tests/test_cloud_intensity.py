@@ -72,10 +72,12 @@ def test_order_and_chunks_change_no_bit():
 
 
 def test_what_has_no_position_or_no_intensity_does_not_count():
-    intensity, points = _measured(4, "bytes"), POINTS.copy()
+    intensity = _measured(4, "bytes")
+    points = POINTS.copy()
     expected = _in_gray(intensity[:2000], points[:2000])
     intensity[2000:2500] = np.nan
-    intensity[2500:], points[2500:, 1] = 1e30, np.nan
+    intensity[2500:] = 1e30
+    points[2500:, 1] = np.nan
     np.testing.assert_array_equal(_in_gray(intensity, points)[:2000], expected)
 
 

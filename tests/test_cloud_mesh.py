@@ -317,7 +317,8 @@ def test_a_second_set_of_texture_coordinates(tmp_path):
     ],
 )
 def test_obj_lines_may_begin_in_other_ways(tmp_path, old, new):
-    path, colors = tmp_path / "a.obj", made.CORNER_COLORS / 255
+    path = tmp_path / "a.obj"
+    colors = made.CORNER_COLORS / 255
     vertices = np.concatenate([made.SQUARE, colors], axis=1)
     path.write_text(made.obj_text(vertices, None, library="", material=""))
     expected = whole(open_mesh, path)
@@ -349,7 +350,8 @@ def test_a_textured_material_without_uv_is_left_out_whatever_its_color(tmp_path)
 
 
 def test_a_texture_of_many_surfaces_is_decoded_once(tmp_path, monkeypatch):
-    decode, calls = mesh_files.Texture.texels, []
+    decode = mesh_files.Texture.texels
+    calls = []
     monkeypatch.setattr(mesh_files.Texture, "texels", lambda self: calls.append(self) or decode(self))
     gltf = made.Gltf()
     pictures = made.QUADRANTS, made.QUADRANTS[::-1].copy()

@@ -30,7 +30,8 @@ def same_bits(a: Cloud, b: Cloud):
 def test_morton_codes_equal_twin():
     rng = np.random.default_rng(1)
     cells = rng.integers(0, 1 << 21, (300, 3))
-    cells[0], cells[1] = 0, (1 << 21) - 1
+    cells[0] = 0
+    cells[1] = (1 << 21) - 1
     codes = morton_codes(cells)
     np.testing.assert_array_equal(codes, naive.interleave(cells))
     assert codes[1] == (1 << 63) - 1

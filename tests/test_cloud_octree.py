@@ -57,7 +57,8 @@ def test_a_floor_at_a_round_height_is_one_layer_at_every_level(z):
 
 def test_a_larger_index_names_the_same_rows_and_the_table_may_be_fed_with_nothing():
     index, larger = np.zeros(64, np.int32), np.zeros(256, np.int32)
-    rows, base = np.full((40, voxel_table.NUM_COLUMNS), -1, np.int32), np.zeros(3, np.int64)
+    rows = np.full((40, voxel_table.NUM_COLUMNS), -1, np.int32)
+    base = np.zeros(3, np.int64)
     raw = seeded_cloud(16, 41)
     assert voxel_table.add_points(raw.points_world, raw.colors, base, index, rows, 0) == (40, 40)
     voxel_table.fill_index(rows, 40, larger)
@@ -228,6 +229,7 @@ def test_without_leaves_their_parents_are_the_leaves():
 
 def test_collects_no_more_than_there_is_room_for():
     octree = _octree(*_cloud())
-    found, directions = np.full(110, -1, np.int32), np.zeros((3, 100), np.float32)
+    found = np.full(110, -1, np.int32)
+    directions = np.zeros((3, 100), np.float32)
     assert collect(octree, np.zeros(3), 1 / 300, EVERYWHERE, found[:100], directions) == 100
     assert (found[100:] == -1).all()

@@ -272,7 +272,8 @@ def test_a_file_that_is_not_finished_is_closed(tmp_path, monkeypatch, suffix):
     source = tmp_path / "cloud.ply"
     points = np.random.default_rng(4).uniform(0, 9, (3000, 3))
     rooms.write_ply(source, vertex_rows(points, np.full((3000, 3), 9, np.uint8)))
-    closed, close = [], laspy.LasWriter.close
+    closed = []
+    close = laspy.LasWriter.close
     monkeypatch.setattr(laspy.LasWriter, "close", lambda self: closed.append(close(self)))
 
     def fail(_):

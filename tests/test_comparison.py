@@ -61,7 +61,8 @@ def test_a_photo_is_sampled_as_its_twin():
     is_valid[:30] = False
     v, u = np.mgrid[0:128, 0:256] / 256 * 2 * np.pi
     rgb = np.stack([127 + 100 * np.sin((k + 1) * u + v) for k in range(3)], axis=-1).astype(np.uint8)
-    offsets, texels = rng.normal(size=(3, 900)).astype(np.float32), pack_texels(rgb, is_valid)
+    offsets = rng.normal(size=(3, 900)).astype(np.float32)
+    texels = pack_texels(rgb, is_valid)
     weights = rng.uniform(0.5, 1.5, 900).astype(np.float32)
     colors, shared, rays = (np.empty(shape, np.float32) for shape in ((3, 900), 900, (3, 900)))
     center = np.array([0.01, -0.02, 0.03])

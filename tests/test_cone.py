@@ -30,7 +30,8 @@ def _narrow(turn):
     outside = mask_outside_field(2 * WIDTH, 70.0, 0.0)
     rays = pixel_rays(WIDTH) @ turn
     pixels = naive.project(rays.reshape(-1, 3), np.eye(3), np.zeros(3), 2 * WIDTH).astype(int)
-    rows, columns = np.minimum(pixels[:, 1], WIDTH - 1), pixels[:, 0] % (2 * WIDTH)
+    rows = np.minimum(pixels[:, 1], WIDTH - 1)
+    columns = pixels[:, 0] % (2 * WIDTH)
     return _image(~outside[rows, columns].reshape(WIDTH // 2, WIDTH))
 
 
@@ -91,7 +92,9 @@ def test_the_cells_are_those_within_the_margin_of_the_cone_around_the_photo():
     np.testing.assert_allclose(cone.axis, ROLLED[:, 0], atol=0.02)
     corner = math.atan(math.hypot(1.0, 0.75) * math.tan(math.radians(35.0)))
     assert math.acos(cone.cos_angle) - CONE_MARGIN == pytest.approx(corner, abs=PIXEL)
-    R, center, offsets = exp_so3(rng.normal(size=3)), rng.normal(0.0, 0.1, 3), _cells(rng)
+    R = exp_so3(rng.normal(size=3))
+    center = rng.normal(0.0, 0.1, 3)
+    offsets = _cells(rng)
     rays_cam = rotate_points(offsets.T * float(UNIT) - center, R)
     angle = np.arccos(rays_cam @ cone.axis / np.linalg.norm(rays_cam, axis=1))
     off = np.abs(angle - math.acos(cone.cos_angle))

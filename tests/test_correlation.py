@@ -18,7 +18,8 @@ WIDE_AREA = wider_cells(12)[1]
 
 
 def test_scores_equal_correlations_one_by_one():
-    rng, scan_map = np.random.default_rng(0), rooms.scan_map(1)
+    rng = np.random.default_rng(0)
+    scan_map = rooms.scan_map(1)
     query = rooms.ask(rooms.scene(1)[1], scan_map)
     samples, validity = turn_panorama(query.photo.images.search(), uniform_rotations(50))
     validity[:, rng.random(validity.shape[1]) < 0.2] = 0
@@ -27,14 +28,16 @@ def test_scores_equal_correlations_one_by_one():
     candidate, rotation = rng.integers(0, len(scan_map.centers), 40), rng.integers(0, 50, 40)
     row, views = scan_map.views.at(candidate, Workers(2))
     pairs = np.empty(40, np.float32)
-    features, seen = views.features.reshape(len(views.features), -1), views.is_seen.view(np.uint8)
+    features = views.features.reshape(len(views.features), -1)
+    seen = views.is_seen.view(np.uint8)
     scores = correlation.masked_correlation(features, seen, panorama, Workers(2))
     how = whole_areas(24), panorama, row, rotation
     correlation.correlate_pairs(views.features, views.is_seen, *how, pairs)
     twin = []
     for c, r in zip(row, rotation, strict=True):
         w = AREA * views.is_seen[c] * validity[r]
-        f, s = views.features[c].astype(float), samples[r].astype(float)
+        f = views.features[c].astype(float)
+        s = samples[r].astype(float)
         twin.append((w * f * s).sum() / np.sqrt((w * f * f).sum() * (w * s * s).sum()))
     for found in (scores[row, rotation], pairs):  # each up to a factor of its own
         factor = (found @ twin) / (found @ found)

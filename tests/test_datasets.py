@@ -23,6 +23,8 @@ from research.datasets.convert_dataset import (
 from research.datasets.model import AXES, DIRECTIONS, ConvertOptions, pose_of_transform
 from research.scene import read_scene
 
+pytestmark = pytest.mark.research
+
 ORIGIN = np.array([10.0, -4.0, 2.0])
 
 

@@ -12,6 +12,8 @@ from plyfile import PlyData, PlyElement
 from piccolo.cloud.writers import vertex_rows
 from research.scene import read_scene
 
+pytestmark = pytest.mark.research
+
 # 360loc
 SEQUENCES = ("daytime_360_1", "nighttime_360_2")
 
@@ -84,7 +86,8 @@ def write_skybox(folder, place, R_world_from_cam5, center):
         made.write_picture(folder / "matterport_skybox_images" / f"{place}_skybox{number}_sami.jpg", rgb)
     for yaw in range(6):
         angle = np.radians(60.0) * (yaw - 5)  # clockwise from stop to stop: about y, which points down
-        c, s = np.cos(angle), np.sin(angle)
+        c = np.cos(angle)
+        s = np.sin(angle)
         R_world_from_cam = R_world_from_cam5 @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
         position = center + RADIUS * R_world_from_cam[:, 2]
         T = np.vstack([np.column_stack([R_world_from_cam, position]), [0, 0, 0, 1]])

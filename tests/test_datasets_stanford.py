@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from research.datasets import convert_dataset
 from research.scene import find_scenes
 
+pytestmark = pytest.mark.research
+
 LABELS = ["<UNK>_0_<UNK>_0_0", "chair_1_office_1_1", "wall_1_office_1_1", "clutter_7_office_1_1"]
 CHAIR, WALL, CLUTTER = 9, 3, 13
 MISSING = (0x0D, 0x0D, 0x0D)

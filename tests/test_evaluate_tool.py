@@ -20,6 +20,8 @@ from research.evaluation import evaluate
 from research.evaluation.query_result import read_run
 from research.scene import Query, read_scene, write_queries
 
+pytestmark = pytest.mark.research
+
 TIER = "scene"
 
 QUICK = ["--quiet", "--preset", "paper", "max_points=20000", "num_translations=12", "num_iterations=30"]
@@ -60,7 +62,8 @@ def test_a_run_its_tables_and_files(scenes, tmp_path, capsys):
     assert _run(scenes, out, *options) == 0
     text = capsys.readouterr().out
     rows = read_run(out)[0]
-    hall, room = [("hall 2", True)] * 2 + [("hall 2", False)], [("room", True)] * 2
+    hall = [("hall 2", True)] * 2 + [("hall 2", False)]
+    room = [("room", True)] * 2
     assert [(row.scene, row.is_in_box) for row in rows] == hall + room
     assert rows[2].position_error > 50.0
     assert "all 5 queries; correct" in text
@@ -134,7 +137,9 @@ def test_results_of_localize_are_those_of_the_scene_s_cloud(scenes, tmp_path, ca
 
 
 def test_no_output_replaces_an_input_or_another_output(scenes, tmp_path, capsys):
-    truth, link, out = scenes / "room" / "queries.json", tmp_path / "link.png", tmp_path / "run.png"
+    truth = scenes / "room" / "queries.json"
+    link = tmp_path / "link.png"
+    out = tmp_path / "run.png"
     before = truth.read_bytes()
     link.hardlink_to(truth)
     for run, errors, message in (
@@ -195,7 +200,9 @@ def test_any_name_that_a_file_may_have_costs_its_own_line_at_most(scenes, tmp_pa
             query["image"] = name
         queries.append({**queries[0], "image": "z" * 5000 + ".jpg"})
 
-    folder, out, csv = _changed(scenes, tmp_path, rename), tmp_path / "run.jsonl", tmp_path / "table.csv"
+    folder = _changed(scenes, tmp_path, rename)
+    out = tmp_path / "run.jsonl"
+    csv = tmp_path / "table.csv"
     assert _run(folder, out, "--csv", str(csv)) == 3
     text, err = capsys.readouterr()
     assert [row.key[1] for row in read_run(out)[0]] == names
@@ -210,7 +217,8 @@ def test_what_the_system_did_is_no_refusal_of_a_photo_without_an_answer(scenes, 
         for query in queries:
             query["answerable"] = False
 
-    folder, out = _changed(scenes, tmp_path, refuse), tmp_path / "run.jsonl"
+    folder = _changed(scenes, tmp_path, refuse)
+    out = tmp_path / "run.jsonl"
     with monkeypatch.context() as patched:
         patched.setattr(picture, "check_memory", lambda *given: memory.check_memory(1e15, *given[1:]))
         assert _run(folder, out) == 3
@@ -219,7 +227,8 @@ def test_what_the_system_did_is_no_refusal_of_a_photo_without_an_answer(scenes, 
 
 
 def test_a_signal_ends_a_run_after_the_photo_at_work(scenes, tmp_path, monkeypatch, capsys):
-    out, answer = tmp_path / "run.jsonl", Localizer.answer
+    out = tmp_path / "run.jsonl"
+    answer = Localizer.answer
 
     def answer_late(self, *given):
         signal.raise_signal(signal.SIGTERM)
@@ -242,7 +251,8 @@ def test_walks_have_a_line_each_and_what_shows_nothing_is_refused(tmp_path, caps
     capsys.readouterr()
     assert _run(folder, out) == 0
     text = capsys.readouterr().out
-    queries, rows = read_scene(folder).by_name, read_run(out)[0]
+    queries = read_scene(folder).by_name
+    rows = read_run(out)[0]
     assert len(rows) == len(queries)
     by_variant = {row.variant: row for row in rows}
     assert by_variant["black"].result.status == "unreadable"

@@ -33,6 +33,8 @@ from research.evaluation.tables import (
 )
 from research.scene import Query, Scene
 
+pytestmark = pytest.mark.research
+
 TRUE_POSE = Pose(exp_so3(np.array([0.4, 0.1, -2.0])), np.array([10.0, -4.0, 1.5]))
 
 

@@ -17,7 +17,7 @@ from piccolo.jobs.threads import num_cores
 from piccolo.judge.result import Result
 from piccolo.result_files import read_results
 
-TIER = "scene"
+TIER = "process"
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,6 @@ class Deadly(Localizer):
         return super().answer(scan, others, task)
 
 
-@pytest.mark.process
 def test_a_photo_that_kills_its_processes_is_a_line_that_says_so(scene, tmp_path, monkeypatch, capsys):
     deadly = tmp_path / "deadly.jpg"
     deadly.write_bytes((scene / "images" / "clean_0.jpg").read_bytes())
@@ -91,7 +90,6 @@ def test_a_photo_that_kills_its_processes_is_a_line_that_says_so(scene, tmp_path
     assert "failed" not in {result.status for result in results}
 
 
-@pytest.mark.process
 def test_a_signal_ends_all_and_the_same_command_goes_on(scene, many, tmp_path):
     out, temporary = tmp_path / "poses.jsonl", tmp_path / "temporary"
     temporary.mkdir()
@@ -112,7 +110,6 @@ def test_a_signal_ends_all_and_the_same_command_goes_on(scene, many, tmp_path):
     assert untimed(out) == many[1]
 
 
-@pytest.mark.process
 def test_a_killed_process_costs_nothing_and_a_killed_parent_leaves_whole_lines(scene, many, tmp_path):
     out = tmp_path / "poses.jsonl"
     words = _words(scene, many[0], "--out", str(out), "--jobs", "2")
@@ -129,7 +126,6 @@ def test_a_killed_process_costs_nothing_and_a_killed_parent_leaves_whole_lines(s
     assert untimed(out) == many[1]
 
 
-@pytest.mark.process
 def test_names_on_standard_input_are_answered_as_they_come(scene):
     name = str(scene / "images" / "clean_1.jpg")
     words = _words(scene, "-", "--jobs", "2")

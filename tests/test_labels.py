@@ -98,7 +98,8 @@ def test_points_without_a_position_need_no_label(tmp_path):
 @pytest.mark.parametrize("is_compressed", [False, True])
 def test_las(tmp_path, point_format, most, is_compressed):
     raw = RawCloud(np.round(POINTS, 2) + OFFSETS, np.zeros((3000, 3), np.uint8))
-    classes, withheld = np.arange(3000) % (most + 1), np.arange(3000) >= 2900
+    classes = np.arange(3000) % (most + 1)
+    withheld = np.arange(3000) >= 2900
     content = las_bytes(raw, point_format, classes=classes, withheld=withheld)
     path = write(tmp_path / "a.las", laz_bytes(content, chunk=700) if is_compressed else content)
     read = whole(open_source, path, READ)
@@ -159,7 +160,8 @@ def test_ignored_labels_and_masks_do_not_count_and_nothing_else_is_masked(tmp_pa
 
 
 def test_pictures_that_do_not_keep_labels_are_refused(tmp_path):
-    gray, rgba = IMAGE.astype(np.uint8), np.zeros((64, 128, 4), np.uint8)
+    gray = IMAGE.astype(np.uint8)
+    rgba = np.zeros((64, 128, 4), np.uint8)
     wanted = "this kind of picture holds no labels, wanted a PNG, grey of 8 or 16 bits or RGB of 8"
     deep_rgb = np.zeros((64, 128, 3), np.uint16)
     for path in (
@@ -240,7 +242,8 @@ def test_wrong_use_of_labels_is_refused(scene, capsys):
 
 
 def test_prepared_map_of_labels_wants_labels(scene, tmp_path, capsys):
-    built, cloud = str(tmp_path / "scan.map"), ["--cloud", str(scene / "cloud.ply")]
+    built = str(tmp_path / "scan.map")
+    cloud = ["--cloud", str(scene / "cloud.ply")]
     assert prepare_map.main([*cloud, "--labels", "--out", built, "--quiet"]) == 0
     capsys.readouterr()
     pano = ["--pano", str(scene / "labels" / "clean_0.png"), "--quiet"]

@@ -83,7 +83,8 @@ def test_a_photo_is_found_in_its_room_with_the_same_bits_for_any_threads(variant
 
 def test_noise_has_no_pose_that_many_matches_agree_with():
     rgb = np.random.default_rng(9).integers(0, 256, (256, 512, 3)).astype(np.uint8)
-    panorama, scan_map = rooms.as_panorama(rgb), rooms.scan_map(1)
+    panorama = rooms.as_panorama(rgb)
+    scan_map = rooms.scan_map(1)
     found = propose_poses(_matches(rooms.ask(panorama, scan_map)), 6, Workers(2))
     assert max([0, *(one.num_matches for one in found)]) < 8
     flat = rooms.ask(rooms.as_panorama(np.full_like(rgb, 90)), scan_map)
@@ -91,7 +92,8 @@ def test_noise_has_no_pose_that_many_matches_agree_with():
 
 
 def test_poses_that_contradict_a_prior_are_told():
-    scan_map, world = rooms.scan_map(1), rooms.query(1).pose
+    scan_map = rooms.scan_map(1)
+    world = rooms.query(1).pose
     x, y, z = world.center_world
     heading = np.degrees(np.arctan2(*world.R_cam_from_world[0, :2]))
     for prior, wrong in (

@@ -64,7 +64,8 @@ def test_turning_the_sphere_turns_the_keypoints():
 
 def test_what_views_share_counts_once():
     """No two keypoints of the same place, size and tangent are of different views."""
-    found, middles = _found(), VIEWS[0].middles
+    found = _found()
+    middles = VIEWS[0].middles
     assert len(middles) == len(VIEWS_DEG) == 20
     own = np.argmax(found.rays @ middles.T, axis=1)
     assert len(np.unique(own)) > 10
@@ -76,7 +77,8 @@ def test_what_views_share_counts_once():
 
 
 def test_halves_of_the_views_are_every_other_one_and_find_what_all_find():
-    gray, whole = _gray(), _found()
+    gray = _gray()
+    whole = _found()
     is_valid = np.ones(gray.shape, bool)
     assert sorted(HALVES[0] + HALVES[1]) == list(range(len(VIEWS_DEG)))
     halves = [find_keypoints(gray, is_valid, [VIEWS[k] for k in half], Workers(2)) for half in HALVES]

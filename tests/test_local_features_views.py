@@ -178,7 +178,9 @@ def test_the_nearest_surface_wins_with_its_grey_and_range():
 
 
 def test_ranges_and_greys_are_those_of_the_room():
-    _, true_pose, room = rooms.scene(1)[1], rooms.scene(1)[2], rooms.room(1)[0].rooms[0]
+    _ = rooms.scene(1)[1]
+    true_pose = rooms.scene(1)[2]
+    room = rooms.room(1)[0].rooms[0]
     view = render_gray(rooms.scan_map(1).octree, Pose(np.eye(3), true_pose.center_world), EVERYWHERE)
     rays = pixel_rays(WIDTH).reshape(-1, 3)
     center_world = rooms.query(1).pose.center_world
@@ -198,7 +200,8 @@ def test_a_turned_camera_sees_the_same_along_its_rays():
     level = render_gray(rooms.scan_map(1).octree, Pose(np.eye(3), center), EVERYWHERE)
     turned = render_gray(rooms.scan_map(1).octree, Pose(R, center), EVERYWHERE)
     indices = compute_indices(pixel_rays(WIDTH) @ R, WIDTH)  # x_map = R_cam_from_map.T @ x_cam
-    gray, ranges = level.gray[indices].astype(float), level.ranges[indices]
+    gray = level.gray[indices].astype(float)
+    ranges = level.ranges[indices]
     is_shown = turned.is_filled & level.is_filled[indices]
     assert is_shown.mean() > 0.95
     assert np.median(np.abs(turned.gray - gray)[is_shown]) <= 3
@@ -242,7 +245,8 @@ def test_what_is_seen_through_a_thin_scan_is_dropped():
 
 @pytest.mark.parametrize(("gap", "is_closed"), [(3, True), (6, True), (100, False)])
 def test_gaps_are_filled_with_what_is_around_them(gap, is_closed):
-    gray, weight = np.full((128, 256), 0.25, np.float32), np.ones((128, 256), np.float32)
+    gray = np.full((128, 256), 0.25, np.float32)
+    weight = np.ones((128, 256), np.float32)
     gray[:, 128:] = 0.75
     weight[14 : 14 + gap, 30 : 30 + gap] = 0.0
     filled, is_filled = fill_gaps(gray * weight, weight)

@@ -37,7 +37,8 @@ SEEDS, VARIANTS = (1, 2, 3), ("clean", "photo", "change", "tilt")
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_camera_is_found_within_millimetres(seed, variant):
-    taken, found = query(seed, variant), _found(seed, variant)
+    taken = query(seed, variant)
+    found = _found(seed, variant)
     distance, angle_deg = errors(found.pose, taken.pose)
     assert found.status == "localized"
     # a 512 px panorama has pixels of 0.7 deg and the photo's is blurred and noisy
@@ -72,7 +73,8 @@ def test_nothing_that_counts_or_no_place_for_a_camera_is_no_error():
 
 
 def test_poses_in_a_cloud_that_a_rotation_turns_upright_are_in_the_files_frame():
-    cloud, taken = room(1)[1], query(1)
+    cloud = room(1)[1]
+    taken = query(1)
     turn = exp_so3(np.array([np.pi / 2, 0.0, 0.0])) @ exp_so3(np.array([0.3, 0.3, 0.0]))
     lying = Cloud((cloud.points @ turn.T).astype(np.float32), cloud.colors, cloud.origin_world)
     lying_map = prepare_map(rooms.stream(lying), Workers(2), turn.T)
@@ -91,7 +93,8 @@ def test_world_and_map_frames_are_inverse():
 
 
 def test_priors_leave_what_they_say():
-    whole, origin = scan_map(1), room(1)[1].origin_world
+    whole = scan_map(1)
+    origin = room(1)[1].origin_world
     turn = exp_so3(np.array([0.0, 0.0, 2.0]))  # of a map that was levelled
     turned = dataclasses.replace(whole, R_map_from_world=turn)
     near_it = Prior(near=tuple(origin + turn.T @ [0.5, 0, 0]), radius=1.0)
@@ -118,8 +121,10 @@ def test_priors_leave_what_they_say():
 
 
 def test_a_prior_that_allows_nothing_says_what_was_left_out():
-    whole, origin = scan_map(1), room(1)[1].origin_world
-    num, heights = len(whole.centers), heights_above_floor(whole.octree, whole.centers)
+    whole = scan_map(1)
+    origin = room(1)[1].origin_world
+    num = len(whole.centers)
+    heights = heights_above_floor(whole.octree, whole.centers)
     prior = Prior(near=tuple(whole.centers[0] + origin - [50.0, 0.0, 0.0]), radius=1.0, height=(0.5, 1.0))
     settings = dataclasses.replace(rooms.KNOWN, prior=prior)
     (text,) = _localize(1, query(1).rgb, settings).warnings
@@ -185,7 +190,8 @@ def test_deviations_are_of_the_size_of_the_errors():
     """Squared errors, weighed by their covariance: 5.3 in the median for six numbers if all is right."""
     squares = []
     for seed, variant in itertools.product(SEEDS, VARIANTS):
-        taken, found = query(seed, variant), _found(seed, variant)
+        taken = query(seed, variant)
+        found = _found(seed, variant)
         turn = log_so3(taken.pose.R_cam_from_world @ found.pose.R_cam_from_world.T)
         error = np.concatenate([turn, taken.pose.center_world - found.pose.center_world])
         squares.append(error @ np.linalg.solve(found.covariance.matrix, error))

@@ -40,7 +40,8 @@ class Photo(NamedTuple):
 
 @pytest.fixture(scope="module")
 def found():
-    scan_map, panorama = rooms.scan_map(2), as_panorama(query(2).rgb)
+    scan_map = rooms.scan_map(2)
+    panorama = as_panorama(query(2).rgb)
     prepared = rooms.ask(panorama, scan_map, rooms.KNOWN)
     result = rooms.locate(panorama, scan_map, rooms.KNOWN)
     return prepared, scan_map.from_world(result.pose), result
@@ -230,7 +231,8 @@ def turn_half(rgb, azimuth, turn):
 
 @pytest.mark.parametrize(("seed", "azimuth", "turn"), [(1, 0.0, (0, 0, 0.03)), (3, 1.0, (0.02, 0, 0))])
 def test_a_half_that_is_turned_widens_the_covariance_until_it_covers_the_true_position(seed, azimuth, turn):
-    taken, scan_map = query(seed), rooms.scan_map(seed)
+    taken = query(seed)
+    scan_map = rooms.scan_map(seed)
     errors, stds = [], []
     for rgb in (taken.rgb, turn_half(taken.rgb, azimuth, np.array(turn))):
         found = rooms.locate(as_panorama(rgb), scan_map, rooms.KNOWN)
@@ -282,7 +284,8 @@ def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
         [PointSource(Path("repeated"), lambda: iter([RawCloud(points.astype(float), colors)]))]
     )
     taken = make_query(world, 0, "clean", rooms.WIDTH, Workers(2))
-    built, panorama = prepare_map(cloud, Workers(2)), as_panorama(taken.rgb)
+    built = prepare_map(cloud, Workers(2))
+    panorama = as_panorama(taken.rgb)
     result = rooms.locate(panorama, built)
     poses = [result.best_pose, *(h.pose for h in result.alternatives)]
     distances = [errors(pose, taken.pose)[0] for pose in poses]

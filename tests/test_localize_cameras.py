@@ -34,7 +34,8 @@ DUAL = (Mount(FISHEYE), Mount(FISHEYE, BACK, offset=(256, 0)))
 
 def cut(full, mount):
     """The picture of a camera (H, W, 3), cut from a panorama of the same place."""
-    camera, width = mount.camera, full.shape[1]
+    camera = mount.camera
+    width = full.shape[1]
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
     rays = camera.rays(np.stack([u, v], axis=-1))[0] @ mount.rotation
     x = width * (0.5 - np.arctan2(rays[..., 1], rays[..., 0]) / (2 * np.pi))

@@ -19,11 +19,14 @@ from research.experiments import loss_surface as tool
 from research.experiments.loss_surface import LossSurface, PoseGrid, loss_surface
 from research.scene import read_scene
 
+pytestmark = pytest.mark.research
+
 STEP = 0.3
 
 
 def _scene(variant):
-    cloud, query = rooms.room(2)[1], rooms.query(2, variant)
+    cloud = rooms.room(2)[1]
+    query = rooms.query(2, variant)
     pose = Pose(query.pose.R_cam_from_world, query.pose.center_world - cloud.origin_world)
     small = cv2.resize(query.rgb, (128, 64), interpolation=cv2.INTER_AREA)
     return pack_points(cloud.points, cloud.colors), pack_texels(small), pose
@@ -66,7 +69,8 @@ def test_a_place_has_the_least_of_its_losses_with_the_same_bits_on_any_number_of
 
 def test_walls_and_outside_are_not_free():
     points, texels, pose = _scene("clean")
-    low, high = points.x.min(), points.x.max()
+    low = points.x.min()
+    high = points.x.max()
     x = np.array([low - 2.0, low, pose.center_world[0], high, high + 2.0])
     grid = PoseGrid(x, pose.center_world[1:2], pose.center_world[2:], pose.R_cam_from_world[None])
     surface = loss_surface(points, texels, grid, 5000, Workers(2))
@@ -75,7 +79,11 @@ def test_walls_and_outside_are_not_free():
 
 def test_minima_are_counted_in_free_space():
     loss = np.full((7, 9), 0.5)
-    loss[1, 1], loss[1, 2], loss[5, 8], loss[3, 5], loss[0, 5] = 0.1, 0.2, 0.3, 0.4, np.inf
+    loss[1, 1] = 0.1
+    loss[1, 2] = 0.2
+    loss[5, 8] = 0.3
+    loss[3, 5] = 0.4
+    loss[0, 5] = np.inf
     is_free = np.ones(loss.shape, np.bool_)
     surface = LossSurface(loss, loss, np.zeros(loss.shape, np.int64), is_free)
     assert surface.lowest() == (1, 1)

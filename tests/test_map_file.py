@@ -45,7 +45,8 @@ def _save(path, arrays):
 
 
 def test_round_trip_and_a_file_cut_short(tmp_path):
-    made, built = make_map(1, 20_000), tmp_path / "a.map"
+    made = make_map(1, 20_000)
+    built = tmp_path / "a.map"
     save_map(made, built)
     back = load_map(built)
     for field in dataclasses.fields(back):
@@ -192,7 +193,8 @@ def test_no_octree_of_a_cloud_is_refused(arrays, tmp_path, seed):
     """Turned, far from zero, wide, of one point, and with points on the borders of voxels."""
     rng = np.random.default_rng(seed)
     R = exp_so3(rng.normal(size=3)) if seed % 3 else np.eye(3)
-    table, count = VoxelTable("cloud"), [1, 60, 4000][seed // 4]
+    table = VoxelTable("cloud")
+    count = [1, 60, 4000][seed // 4]
     points = rng.random((count, 3)) * [0.01, 5.0, 300.0, 41_000.0][seed % 4]
     if seed % 2:
         points = np.round(points / LEAF_SIZE) * LEAF_SIZE
@@ -206,7 +208,8 @@ def test_no_octree_of_a_cloud_is_refused(arrays, tmp_path, seed):
 
 
 def test_nodes_are_in_their_parents_voxels():
-    octree, rng = scan_map(1).octree, np.random.default_rng(3)
+    octree = scan_map(1).octree
+    rng = np.random.default_rng(3)
     origin = scan_map(1).R_map_from_world @ scan_map(1).origin_world + PHASE / QUANTA_PER_METRE
     args = octree.first_child, octree.level_start, origin, LEAF_SIZE
     assert first_misplaced(octree.nodes, *args, 100.0) == -1
@@ -214,7 +217,8 @@ def test_nodes_are_in_their_parents_voxels():
     assert not naive.misplaced(octree.nodes, *args).any()
     num_found = 0
     for _ in range(40):
-        nodes, node = octree.nodes.copy(), rng.integers(octree.level_start[1], len(octree.nodes))
+        nodes = octree.nodes.copy()
+        node = rng.integers(octree.level_start[1], len(octree.nodes))
         nodes[node, rng.integers(3)] += rng.choice([0.003, -0.03, 0.2])
         misplaced = naive.misplaced(nodes, *args)
         assert (first_misplaced(nodes, *args, 100.0) >= 0) == misplaced.any()
@@ -281,7 +285,8 @@ def test_no_array_reaches_beyond_the_file(path, monkeypatch):
         with pytest.raises((ValueError, array_archive.struct.error)):
             archive.array("a")
     archive = ArrayArchive(path)
-    archive.members["a"].header_offset, archive.members["a"].file_size = info.header_offset, 10**6
+    archive.members["a"].header_offset = info.header_offset
+    archive.members["a"].file_size = 10**6
     archive.members["a"].compress_size = 10**6
     with pytest.raises(ValueError, match="in another way than a prepared map has it"):
         archive.array("a")

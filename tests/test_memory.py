@@ -113,8 +113,10 @@ def test_work_begins_only_where_errors_can_still_be_raised(address_space):
 def test_voxels_and_their_octree_take_what_they_say(monkeypatch):
     for module in (voxels_module, octree):
         monkeypatch.setattr(module, "VOXELS_AT_ONCE", 1 << 10)
-    rng, num = np.random.default_rng(0), 200_000
-    points, colors = rng.uniform(0, 60, (num, 3)), rng.integers(0, 256, (num, 3), np.uint8)
+    rng = np.random.default_rng(0)
+    num = 200_000
+    points = rng.uniform(0, 60, (num, 3))
+    colors = rng.integers(0, 256, (num, 3), np.uint8)
     kernels_compiled = voxels_module.VoxelTable("a.ply")
     kernels_compiled.add(points[: num // 4], colors[: num // 4])
     kernels_compiled.finish()
@@ -161,14 +163,16 @@ def test_what_libraries_raise_when_memory_is_short(address_space):
 
 def test_all_that_grows_asks_first(limiting, tmp_path):
     picture = tmp_path / "a.png"
-    whole, taken = scan_map(1), as_panorama(query(1).rgb)
+    whole = scan_map(1)
+    taken = as_panorama(query(1).rgb)
     cv2.imwrite(str(picture), taken.rgb)
     rng = np.random.default_rng(0)
     table = voxels_module.VoxelTable("a.ply")
     workers = Workers(1)
     asked = ask_photo(taken, whole)
     limiting(1e-6)
-    spread, colors = rng.uniform(0, 90, (50_000, 3)), np.full((50_000, 3), 9, np.uint8)
+    spread = rng.uniform(0, 90, (50_000, 3))
+    colors = np.full((50_000, 3), 9, np.uint8)
     for text, ask in (
         ("a.png: found 512 x 256, which needs 0.0016 GB", lambda: read_panorama(picture)),
         ("a.ply: a table of more than 32768 voxels", lambda: table.add(spread, colors)),

@@ -19,7 +19,8 @@ def _areas(shape):
 
 def _caps(rng, width, fraction, radius_deg=(8.0, 30.0)):
     """Round occluders near the horizon that hide a fraction of the sphere: mask (H, W), and a number each."""
-    rays, number = pixel_rays(width), np.zeros((width // 2, width), int)
+    rays = pixel_rays(width)
+    number = np.zeros((width // 2, width), int)
     while (_areas(number.shape) * (number > 0)).sum() < fraction * 4.0 * np.pi:
         axis = rng.normal(size=3) * [1.0, 1.0, 0.4]
         cosine = np.cos(np.radians(rng.uniform(*radius_deg)))
@@ -29,7 +30,8 @@ def _caps(rng, width, fraction, radius_deg=(8.0, 30.0)):
 
 def _occluded(panorama, number, rng, contrast):
     """The photo with coloured surfaces, each with a pattern of its own, where there is a number."""
-    rgb, (height, width) = panorama.rgb.copy(), number.shape
+    rgb = panorama.rgb.copy()
+    (height, width) = number.shape
     for n in range(1, number.max() + 1):
         pattern = rng.integers(30, 226, 3) + rng.normal(0.0, contrast, (12, 24, 3))
         texture = pattern.clip(0, 255).astype(np.uint8)
@@ -76,7 +78,8 @@ def test_an_unchanged_room_contradicts_nothing_whatever_the_exposure(gains):
 def test_turning_the_camera_turns_the_mask():
     """The seam is no edge, and the mask is in the photo's own frame."""
     points, panorama, pose = rooms.scene(2)
-    rng, quarter = np.random.default_rng(0), rooms.WIDTH // 4
+    rng = np.random.default_rng(0)
+    quarter = rooms.WIDTH // 4
     photo = _occluded(panorama, _caps(rng, rooms.WIDTH, 0.2), rng, 40.0)
     turned = rooms.as_panorama(np.roll(photo.rgb, quarter, axis=1))
     R = exp_so3(np.array([0.0, 0.0, -np.pi / 2.0])) @ pose.R_cam_from_world
@@ -117,7 +120,8 @@ def test_nothing_in_common_is_neither_explained_nor_contradicted():
 
 def test_squared_differences_are_as_their_formula_says():
     """Beyond a range in the photo's contrast, less where the photo or the scan is flat; nothing is unseen."""
-    rng, shape = np.random.default_rng(0), (20, 30, 3)
+    rng = np.random.default_rng(0)
+    shape = (20, 30, 3)
     channels, means = rng.random(shape), rng.random((2, *shape))
     per_deviation = 1.0 / rng.uniform(0.01, 0.5, (2, *shape))
     low, high = np.sort(rng.normal(0.0, 1.0, (2, *shape)), axis=0)

@@ -28,7 +28,8 @@ TIER = "scene"
 
 @pytest.fixture(scope="module")
 def cloud(tmp_path_factory):
-    path, points = tmp_path_factory.mktemp("cloud") / "a.npy", np.random.default_rng(1).random((500, 3))
+    path = tmp_path_factory.mktemp("cloud") / "a.npy"
+    points = np.random.default_rng(1).random((500, 3))
     np.save(path, np.hstack([points, np.full((500, 3), 100.0)]))
     return path
 
@@ -68,7 +69,8 @@ def test_a_damaged_map_is_made_anew_with_one_warning(cloud, tmp_path, monkeypatc
     assert _open(cloud, tmp_path, monkeypatch) == []
     (path,) = tmp_path.glob("*/*.piccolo-map")
     whole = path.read_bytes()
-    middle, directory = len(whole) // 2, whole.rindex(b"PK\x01\x02")
+    middle = len(whole) // 2
+    directory = whole.rindex(b"PK\x01\x02")
     path.write_bytes(
         {
             "flipped": whole[:middle] + bytes([whole[middle] ^ 4]) + whole[middle + 1 :],
@@ -91,7 +93,8 @@ def test_a_damaged_map_is_made_anew_with_one_warning(cloud, tmp_path, monkeypatc
 
 @pytest.mark.parametrize("how", ["a file", "its place is a file", "full disk", "link to nothing"])
 def test_a_cache_that_can_not_be_used_is_a_warning(cloud, tmp_path, monkeypatch, how):
-    folder, limit = tmp_path / "cache", resource.getrlimit(resource.RLIMIT_FSIZE)
+    folder = tmp_path / "cache"
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     if how == "a file":
         folder.touch()
     elif how == "its place is a file":
@@ -234,7 +237,8 @@ def finding(monkeypatch):
 
 @pytest.fixture
 def opened(tmp_path):
-    cache, cloud = CachePolicy(folder=tmp_path / "cache"), rooms.write_cloud(tmp_path / "cloud.ply", 1)
+    cache = CachePolicy(folder=tmp_path / "cache")
+    cloud = rooms.write_cloud(tmp_path / "cloud.ply", 1)
     return lambda: open_map.open_map([Path(cloud)], BY_FILE, cache, WORKERS, Stopwatch())
 
 

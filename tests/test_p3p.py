@@ -39,7 +39,8 @@ def _off(found, R, center):
 
 
 def test_truth_is_found_and_every_pose_sees_the_points():
-    rng, errors = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    errors = []
     num_behind = 0
     for _ in range(NUM_CASES):
         points, R, center = _case(rng)
@@ -57,7 +58,8 @@ def test_truth_is_found_and_every_pose_sees_the_points():
 
 
 def test_poses_are_those_of_poselib_where_all_points_are_in_front():
-    rng, num_compared = np.random.default_rng(2), 0
+    rng = np.random.default_rng(2)
+    num_compared = 0
     for _ in range(500):
         R = rotation_from_quaternion_wxyz(rng.normal(size=4))
         center = RESTS + rng.normal(size=3)
@@ -142,7 +144,8 @@ def _sums(problem, pose):
 
 
 def test_sums_are_those_of_numerical_rows_at_tilted_poses():
-    rng, h = np.random.default_rng(0), 1e-5
+    rng = np.random.default_rng(0)
+    h = 1e-5
     for _ in range(5):
         pose = Pose(rotation_from_quaternion_wxyz(rng.normal(size=4)), rng.normal(size=3))
         bearings, points = _matches(rng, pose, 40, noise=0.2)
@@ -165,7 +168,8 @@ def test_sums_are_those_of_numerical_rows_at_tilted_poses():
 
 
 def _refined(matches, start, scale):
-    R, center = start.R_cam_from_world.copy(), start.center_world.copy()
+    R = start.R_cam_from_world.copy()
+    center = start.center_world.copy()
     loss = descend_matches((*matches, scale), 30, 1e-7, R, center)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-6)
     return Pose(R, center), loss
@@ -188,7 +192,8 @@ def test_pose_is_found_from_afar():
 
 
 def test_wrong_matches_hardly_count():
-    rng, errors = np.random.default_rng(2), []
+    rng = np.random.default_rng(2)
+    errors = []
     for _ in range(50):
         bearings, points = _matches(rng, CAMERA, 80, noise=1e-3)
         wrong = rng.normal(size=(40, 3))

@@ -175,7 +175,8 @@ FOCAL_35MM, ORIENTATION, TIME = 0xA405, 0x0112, 0x9003
 
 def heic(rgb, orientation=1):
     """A HEIC as a phone writes it: a box says how the picture is turned, and EXIF says so too."""
-    image, exif = Image.fromarray(rgb), Image.Exif()
+    image = Image.fromarray(rgb)
+    exif = Image.Exif()
     exif[ORIENTATION] = orientation
     exif.get_ifd(0x8769)[FOCAL_35MM] = 26
     exif.get_ifd(0x8769)[TIME] = "2026:03:01 10:00:00"

@@ -63,7 +63,8 @@ def _photo():
 
 
 def test_value_is_the_mean_over_pixels_that_show_and_count():
-    points, photo = _box(), _photo()
+    points = _box()
+    photo = _photo()
     masked = dataclasses.replace(photo, is_valid=np.random.default_rng(2).random(photo.is_valid.shape) < 0.7)
     view = render_view(points, TURNED, WIDTH)
     norms = np.sqrt(((view.rgb - masked.rgb / 255.0) ** 2).sum(axis=2))
@@ -94,7 +95,9 @@ def test_pixels_move_as_the_points_that_they_show():
 
 
 def test_gradient_goes_the_way_of_differences():
-    points, photo, rng = _box(), _photo(), np.random.default_rng(4)
+    points = _box()
+    photo = _photo()
+    rng = np.random.default_rng(4)
     cosines, ratios = [], []
     for _ in range(12):
         at = step(TURNED, rng.normal(0.0, 0.1, 6))
@@ -137,7 +140,8 @@ def test_descent_recovers_the_true_pose(solver):
 def test_camera_is_found_with_the_same_bits_for_any_number_of_threads(initialization):
     quick = {"num_translations": 20, "max_points": 30_000, "num_iterations": 40, "num_by_histogram": 3}
     settings = PhotometricSettings(photometric_width=128, initialization=initialization, **quick)
-    paper_map, panorama = prepare(room(1)[1], settings), as_panorama(query(1).rgb)
+    paper_map = prepare(room(1)[1], settings)
+    panorama = as_panorama(query(1).rgb)
     one, two = (localize(paper_map, panorama, settings, Workers(n), Stopwatch()) for n in (1, 2))
     assert errors(one.pose, query(1).pose)[0] < 0.1
     np.testing.assert_array_equal(one.pose.center_world, two.pose.center_world)
@@ -145,7 +149,8 @@ def test_camera_is_found_with_the_same_bits_for_any_number_of_threads(initializa
 
 
 def test_masked_or_empty_views_have_no_loss():
-    points, photo = _box(), _photo()
+    points = _box()
+    photo = _photo()
     half = dataclasses.replace(photo, is_valid=photo.is_valid & (np.arange(WIDTH) < WIDTH // 2))
     far = Pose(TURNED.R_cam_from_world, np.array([40.0, 0.0, 0.0]))
     nothing = dataclasses.replace(photo, is_valid=np.zeros_like(photo.is_valid))

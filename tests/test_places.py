@@ -41,7 +41,8 @@ def test_a_field_is_that_of_a_level_pinhole(fov_deg, yaw):
     focal = 0.5 / np.tan(np.radians(fov_deg) / 2)  # of an image 1 wide and 0.75 high
     rays = pixel_rays(WIDTH).reshape(-1, 3)
     azimuth = np.arctan2(rays[:, 1], rays[:, 0]) - yaw
-    right, elevation = -np.tan(azimuth), np.arcsin(rays[:, 2])
+    right = -np.tan(azimuth)
+    elevation = np.arcsin(rays[:, 2])
     down = -np.tan(elevation) / np.cos(azimuth)
     is_inside = (np.cos(azimuth) > 0) & (np.abs(focal * right) <= 0.5) & (np.abs(focal * down) <= 0.375)
     assert (is_outside.ravel() == ~is_inside).mean() > 0.9999

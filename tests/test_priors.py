@@ -137,7 +137,8 @@ def test_a_position_becomes_a_prior_of_any_height():
 
 
 def test_a_photo_is_searched_about_its_position_and_then_anywhere(tmp_path):
-    cloud, taken = rooms.room(1)[1], rooms.query(1)
+    cloud = rooms.room(1)[1]
+    taken = rooms.query(1)
     points = cloud.points + cloud.origin_world + OFFSET
     scan = piccolo.open_scan(piccolo.Cloud(points, colors=cloud.colors, crs=UTM))
     here = taken.pose.center_world + OFFSET

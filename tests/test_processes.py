@@ -65,7 +65,8 @@ def _outcome(wait):
 def test_values_come_in_order_and_a_killed_process_costs_one_at_most(tmp_path):
     lost = "WorkerLostError: each of 2 processes at work on it was killed by SIGKILL"
     expected = [k * k for k in range(12)]
-    expected[5], expected[9] = lost, "InputError: nine"
+    expected[5] = lost
+    expected[9] = "InputError: nine"
     with closing(Processes(partial(_squares, tmp_path), 2)) as processes:
         pairs = [(item, _outcome(wait)) for item, wait in processes.values(iter(range(12)))]
     assert pairs == list(enumerate(expected))
@@ -83,7 +84,8 @@ def test_an_error_brings_its_traceback(tmp_path):
 
 
 def test_few_items_are_under_way_and_one_awaited_keeps_nobody(tmp_path):
-    names, taken = queue.SimpleQueue(), []
+    names = queue.SimpleQueue()
+    taken = []
 
     def items():
         while (item := names.get()) is not None:

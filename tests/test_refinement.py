@@ -60,7 +60,8 @@ def test_poses_far_fainter_than_the_best_are_not_compared(scores, kept):
 def test_a_quarter_of_the_beam_is_for_the_best_that_lie_far_apart():
     """Twenty poses in a row 0.2 m apart, and behind them two at other places."""
     x = np.concatenate([0.2 * np.arange(20), [50.0, 60.0]])
-    rotations, centers = np.repeat(np.eye(3)[None], 22, axis=0), np.outer(x, [1.0, 0, 0])
+    rotations = np.repeat(np.eye(3)[None], 22, axis=0)
+    centers = np.outer(x, [1.0, 0, 0])
     near = Nearness(0.15, 0.1)
     kept = best_and_alternatives(rotations, centers, 8, near)
     assert kept.tolist() == [0, 1, 2, 3, 4, 5, 6, 9]  # six near ones; of those half a metre apart, two more
@@ -275,7 +276,8 @@ def test_starts_descend_on_their_candidates_views_as_one_does_alone():
     image = _problem(1).photo.images.search()
     distance = np.linalg.norm(scan_map.centers - true_pose.center_world, axis=1)
     k, far = int(np.argmin(distance)), int(np.argmax(distance))
-    candidate, R = np.array([k, far, k]), true_pose.R_cam_from_world
+    candidate = np.array([k, far, k])
+    R = true_pose.R_cam_from_world
     starts = Starts(np.stack([R] * 3), scan_map.centers[candidate], candidate)
     ends, scores = beam.descend_prepared(_problem(1), starts, SECOND, rooms.WORKERS)
     assert ends.candidate.tolist() == [k, k, far]  # the best first
@@ -284,7 +286,8 @@ def test_starts_descend_on_their_candidates_views_as_one_does_alone():
     offsets = (views.offsets[row] * views.offset_unit[row]).astype(np.float32)
     channels = views.features[row].astype(np.float32) / np.float32(63.75)
     weights = (views.is_seen[row] * make_grid(24).solid_angle).astype(np.float32)
-    cells, center = Cells(offsets, channels, weights, scan_map.centers[k]), scan_map.centers[k]
+    cells = Cells(offsets, channels, weights, scan_map.centers[k])
+    center = scan_map.centers[k]
     alone = ladder.descend(cells, image, Pose(R, center), Limits(1.2, 12, 2e-3))
     np.testing.assert_allclose(ends.center_map[0], alone.center_world, atol=1e-4)
     np.testing.assert_allclose(ends.R_cam_from_map[0], alone.R_cam_from_world, atol=1e-4)

@@ -23,6 +23,8 @@ from research.experiments import reproduce_paper
 from research.experiments.reproduce_paper import EXPERIMENTS, conditions_of, flip, thin, with_random_rotation
 from research.scene import Query, read_scene, write_queries
 
+pytestmark = pytest.mark.research
+
 TIER = "scene"
 
 PRESETS = [PaperSettings(), CoarseToFineSettings()]
@@ -43,7 +45,8 @@ def rooms(tmp_path_factory):
 
 def _loss(scene, number):
     """Of a query at its own pose in its own cloud."""
-    query, cloud = scene.queries[number], read_cloud(scene.cloud)
+    query = scene.queries[number]
+    cloud = read_cloud(scene.cloud)
     pose = Pose(query.pose.R_cam_from_world, query.pose.center_world - cloud.origin_world)
     points = visible_points(pack_points(cloud.points, cloud.colors), pose.center_world)
     return sampling_loss(points, pack_texels(read_panorama(query.image).rgb), pose)

@@ -55,13 +55,15 @@ CASES = [
 def test_loss_equals_its_twin(name, where, is_masked):
     """Over the seam and the poles too; masked pixels are left out of sum and count."""
     points, colors = _points(where, 3 * POINTS_A_SUM + 17)
-    image, pose = _smooth_image(), POSES[name]
+    image = _smooth_image()
+    pose = POSES[name]
     is_valid = np.ones(image.shape[:2], dtype=bool)
     if is_masked:
         is_valid[90:] = False
         image[90:] = 0
     expected = naive.sampling_loss(points, colors, image, is_valid, pose.R_cam_from_world, pose.center_world)
-    packed, texels = pack_points(points, colors), pack_texels(image, is_valid)
+    packed = pack_points(points, colors)
+    texels = pack_texels(image, is_valid)
     assert sampling_loss(packed, texels, pose) == pytest.approx(expected, rel=1e-5)
     assert sampling_equations(packed, texels, pose)[0] == pytest.approx(expected, rel=1e-5)
 
@@ -90,7 +92,8 @@ def test_a_crop_has_a_loss_where_it_shows_a_quarter_of_the_points_that_a_full_pa
 @pytest.mark.parametrize("where", ["anywhere", "seam", "zenith", "nadir"])
 def test_gradient_against_central_differences(where):
     points, colors = _points(where)
-    image, pose = _smooth_image(), POSES["tilted"]
+    image = _smooth_image()
+    pose = POSES["tilted"]
     is_valid = np.ones(image.shape[:2], dtype=bool)
     _, gradient, _ = sampling_equations(pack_points(points, colors), pack_texels(image), pose)
 
@@ -104,7 +107,8 @@ def test_gradient_against_central_differences(where):
 
 def test_normal_matrix_equals_jacobians_stacked():
     points, colors = _points("anywhere", 500)
-    image, pose = _smooth_image(), POSES["tilted"]
+    image = _smooth_image()
+    pose = POSES["tilted"]
     _, _, matrix = sampling_equations(pack_points(points, colors), pack_texels(image), pose)
 
     def residuals(delta):
@@ -120,15 +124,18 @@ def test_normal_matrix_equals_jacobians_stacked():
 
 def test_turning_rolls_the_image_and_moving_world_and_camera_together_changes_nothing():
     points, colors = _points("anywhere")
-    packed, image = pack_points(points, colors), _smooth_image()
+    packed = pack_points(points, colors)
+    image = _smooth_image()
     k = 37
     turned = Pose(yaw_rotation(2.0 * math.pi * k / WIDTH) @ POSES["tilted"].R_cam_from_world, CENTER)
     rolled = pack_texels(np.roll(image, k, axis=1))
     expected = sampling_loss(packed, pack_texels(image), POSES["tilted"])
     assert sampling_loss(packed, rolled, turned) == pytest.approx(expected, rel=1e-5)
     points, colors = _points("anywhere")
-    texels, pose = pack_texels(_smooth_image()), POSES["tilted"]
-    turn, shift = exp_so3(np.array([0.5, 0.2, -0.9])), np.array([3.0, -2.0, 1.0])
+    texels = pack_texels(_smooth_image())
+    pose = POSES["tilted"]
+    turn = exp_so3(np.array([0.5, 0.2, -0.9]))
+    shift = np.array([3.0, -2.0, 1.0])
     moved = Pose(pose.R_cam_from_world @ turn.T, turn @ pose.center_world + shift)
     expected = sampling_loss(pack_points(points, colors), texels, pose)
     moved_points = (points.astype(np.float64) @ turn.T + shift).astype(np.float32)

@@ -92,7 +92,8 @@ def test_a_mask_is_left_out_and_settings_are_repeated(scan):
 
 def test_a_scan_is_known_by_its_bytes(tmp_path, scan):
     """A file's digest is that of sha256sum; of arrays it changes with type and shape."""
-    cloud, path = rooms.room(1)[1], tmp_path / "a.txt"
+    cloud = rooms.room(1)[1]
+    path = tmp_path / "a.txt"
     np.savetxt(path, np.hstack([cloud.points[::50], cloud.colors[::50]]), fmt="%.3f")
     expected = hashlib.sha256(path.read_bytes()).hexdigest()
     for options in ({"cache": False}, {"settings": PaperSettings()}):

@@ -80,7 +80,8 @@ def _features_of(scan_map, view_centers):
 
 
 def test_poses_are_those_of_a_map_of_both():
-    a, b = rooms.room(1)[1], _shifted(rooms.room(2)[1], BESIDE)
+    a = rooms.room(1)[1]
+    b = _shifted(rooms.room(2)[1], BESIDE)
     points = np.concatenate([a.points + a.origin_world, b.points + b.origin_world])
     both = Cloud(points, np.concatenate([a.colors, b.colors]), np.zeros(3))
     whole = prepare_map(rooms.stream(both), WORKERS)
@@ -99,7 +100,8 @@ def test_poses_are_those_of_a_map_of_both():
 
 def test_what_the_new_scan_does_not_change_keeps_every_bit():
     """A room 40 m away, behind walls: nothing but views out of openings may change."""
-    old, scan_map = first(), _added(first(), _shifted(rooms.room(2)[1], np.array([40.0, 0.0, 0.0])), "B")
+    old = first()
+    scan_map = _added(first(), _shifted(rooms.room(2)[1], np.array([40.0, 0.0, 0.0])), "B")
     rows, is_gone = _rows(scan_map, old.centers)
     assert not is_gone.any()
     np.testing.assert_array_equal(rows, np.arange(len(old.centers)))
@@ -111,13 +113,15 @@ def test_what_the_new_scan_does_not_change_keeps_every_bit():
     centers = old.local_features.view_centers
     assert _features_of(scan_map, centers) == _features_of(old, centers)
     np.testing.assert_array_equal(scan_map.local_features.middles, old.local_features.middles)
-    leaves, joined = old.octree.level(LEAF_SIZE), scan_map.octree.level(LEAF_SIZE)
+    leaves = old.octree.level(LEAF_SIZE)
+    joined = scan_map.octree.level(LEAF_SIZE)
     assert set(map(bytes, leaves)) < set(map(bytes, joined))
 
 
 def test_views_are_made_anew_where_the_new_scan_is_seen():
     """A column in the room: no candidate in it, and those around see it."""
-    old, size = first(), np.array([0.5, 0.5, 2.0])
+    old = first()
+    size = np.array([0.5, 0.5, 2.0])
     rng = np.random.default_rng(5)
     points = rng.uniform(-0.5, 0.5, (20_000, 3)) * size
     side = rng.integers(3, size=len(points))
@@ -130,7 +134,8 @@ def test_views_are_made_anew_where_the_new_scan_is_seen():
     scan_map = _added(old, column, "column")
     gone = _rows(scan_map, old.centers)[1]
     beside = np.abs(old.centers - place) - size / 2
-    inside, far = (beside < 0.0).all(axis=1), np.linalg.norm(np.maximum(beside, 0.0), axis=1) > 0.35
+    inside = (beside < 0.0).all(axis=1)
+    far = np.linalg.norm(np.maximum(beside, 0.0), axis=1) > 0.35
     assert gone[(np.abs(beside).min(axis=1) < MIN_CLEARANCE / 2) & inside].all()
     assert not gone[far].any()
     known = old.sparse[far[old.sparse]]
@@ -152,7 +157,8 @@ def test_views_are_made_anew_where_the_new_scan_is_seen():
 
 
 def test_within_tells_two_equal_rooms_apart():
-    cloud, shift = rooms.room(1)[1], np.array([9.0, 0.0, 0.0])
+    cloud = rooms.room(1)[1]
+    shift = np.array([9.0, 0.0, 0.0])
     scan_map = _added(first(), _shifted(cloud, shift), "B")
     assert scan_map.scan_names == ("A", "B")
     either = _localized(scan_map, 1)
@@ -205,7 +211,8 @@ def test_a_map_of_two_scans_by_the_command_line(tmp_path, capsys):
     """Added in place; the result names the scan; a name that no scan has is one line."""
     elsewhere = rooms.scan_map(1).origin_world + np.array([0.0, 64.0, 0.0])  # 25 of the largest voxels
     save_map(replace(rooms.scan_map(1), origin_world=elsewhere), tmp_path / "house.map")
-    path, out = str(tmp_path / "house.map"), tmp_path / "out.json"
+    path = str(tmp_path / "house.map")
+    out = tmp_path / "out.json"
     room = rooms.write_room(tmp_path / "upper", "--seed 3 --points 30000 --panoramas 1 --width 512")
     cloud, pano = str(room / "cloud.ply"), str(room / "images" / "clean_0.jpg")
     assert prepare_command.main(["--cloud", cloud, "--add", cloud, "--out", path, "--quiet"]) == 3

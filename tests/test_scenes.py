@@ -12,6 +12,8 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
 from research.scene import Query, find_scenes, read_scene, write_queries
 
+pytestmark = pytest.mark.research
+
 POSE = Pose(exp_so3(np.array([0.3, -1.2, 2.0])), np.array([500_123.25, -3.5, 1.125]))
 
 

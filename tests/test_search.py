@@ -75,7 +75,8 @@ def test_samples_along_turned_directions_equal_their_twin():
 
 
 def test_wide_samples_are_averages_by_area():
-    rng, (cells, areas) = np.random.default_rng(3), wider_cells(12)
+    rng = np.random.default_rng(3)
+    (cells, areas) = wider_cells(12)
     samples = rng.uniform(-127.5, 127.5, (600, 3, len(AREA))).astype(np.float32)
     validity = (rng.random((600, len(AREA))) < 0.6).astype(np.float32)
     matrix = (np.eye(len(areas))[cells] * whole_areas(24)[:, None]).astype(np.float32)
@@ -87,7 +88,8 @@ def test_wide_samples_are_averages_by_area():
 
 @pytest.mark.parametrize(("tilts", "most"), [("known", 10), ("any", 100)])
 def test_best_score_is_near_the_true_pose(tilts, most):
-    true_pose, scan_map = rooms.scene(1)[2], rooms.scan_map(1)
+    true_pose = rooms.scene(1)[2]
+    scan_map = rooms.scan_map(1)
     rotations = uniform_yaws(48) if tilts == "known" else uniform_rotations(2000)
     samples, validity = search.turn_panorama(_problem().photo.images.search(), rotations)
     sparse, rotation, values = search.best_poses_wide(scan_map, samples, validity, 200, 512, Workers(2))
@@ -104,7 +106,8 @@ def test_best_score_is_near_the_true_pose(tilts, most):
 
 
 def test_a_part_of_the_candidates_at_a_time_gives_the_same_poses():
-    scan_map, rotations = rooms.scan_map(1), uniform_rotations(200)
+    scan_map = rooms.scan_map(1)
+    rotations = uniform_rotations(200)
     samples, validity = search.turn_panorama(_problem().photo.images.search(), rotations)
     num = len(scan_map.sparse)
     whole = search.best_poses_wide(scan_map, samples, validity, 500, num, Workers(1))

@@ -35,7 +35,8 @@ def test_pixel_of_a_direction_equals_its_twin():
 
 def test_arctangent_polynomial_error():
     angles = np.linspace(-np.pi, np.pi, 100_001)[1:]
-    x, y = np.cos(angles).astype(np.float32), np.sin(angles).astype(np.float32)
+    x = np.cos(angles).astype(np.float32)
+    y = np.sin(angles).astype(np.float32)
     ours = np.array([sphere.atan2(b, a) for a, b in zip(x[::50], y[::50], strict=True)], dtype=np.float64)
     theirs = np.arctan2(y[::50].astype(np.float64), x[::50].astype(np.float64))
     assert np.abs(ours - theirs).max() < 6e-7
@@ -112,7 +113,8 @@ def test_a_cells_centre_lies_in_it(num_rings):
 
 
 def test_neighbours_are_near_and_weighted_by_a_gaussian():
-    near, grid = sphere.make_neighbors(24, 14.0), sphere.make_grid(24)
+    near = sphere.make_neighbors(24, 14.0)
+    grid = sphere.make_grid(24)
     for cell in (0, len(grid) // 2, len(grid) - 1):
         rows = slice(near.row[cell], near.row[cell + 1])
         angle = np.arccos(np.clip(grid.directions[near.cell[rows]] @ grid.directions[cell], -1, 1))
@@ -138,12 +140,14 @@ def test_interpolated_values_are_those_of_a_smooth_field(num_rings, coarse_rings
 
 
 def test_wider_cells_add_up_the_solid_angle_in_whole_numbers():
-    (cells, areas), wide = sphere.wider_cells(12), sphere.make_grid(12)
+    (cells, areas) = sphere.wider_cells(12)
+    wide = sphere.make_grid(12)
     np.testing.assert_array_equal(areas, np.rint(areas))
     np.testing.assert_array_equal(np.unique(cells), np.arange(len(wide)))
     apart = np.arccos(np.sum(wide.directions[cells] * sphere.make_grid(24).directions, axis=1))
     assert apart.max() < np.pi / 12
-    area, units = sphere.make_grid(24).solid_angle, sphere.whole_areas(24)
+    area = sphere.make_grid(24).solid_angle
+    units = sphere.whole_areas(24)
     np.testing.assert_allclose(units, 1000 * area / area.max(), atol=0.51)
     np.testing.assert_array_equal(areas, [units[cells == k].sum() for k in range(len(wide))])
     np.testing.assert_allclose(areas / areas.sum(), wide.solid_angle, rtol=0.5)

@@ -154,7 +154,8 @@ sys.exit(main(sys.argv[1:]))
 @pytest.mark.parametrize("name", ["one colour", "one point", "one wall"])
 def test_scans_of_nearly_nothing_are_no_error(tmp_path, scene, capsys, name):
     rng = np.random.default_rng(0)
-    points, colors = rng.uniform(0.0, 4.0, (20_000, 3)), rng.integers(0, 256, (20_000, 3))
+    points = rng.uniform(0.0, 4.0, (20_000, 3))
+    colors = rng.integers(0, 256, (20_000, 3))
     points[np.arange(20_000), rng.integers(0, 3, 20_000)] = 4.0 * rng.integers(0, 2, 20_000)
     changed = {"one colour": colors, "one point": points, "one wall": points[:, 1]}
     changed[name][:] = 120

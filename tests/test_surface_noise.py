@@ -42,7 +42,8 @@ def test_a_part_of_the_noise_alike_in_all_directions(noise):
 @pytest.mark.parametrize("gap", [0.03, 0.05])
 def test_a_doubled_scan_has_half_the_gap_along_the_shift_alone(gap):
     """Also where the shift is along a wall, which then does not show it."""
-    points, along = _room(800_000), TURN[:, 0]
+    points = _room(800_000)
+    along = TURN[:, 0]
     points[::2] += gap * along
     deviations, axes = _deviations(points)
     assert abs(axes[:, 2] @ along) > 0.94

@@ -79,7 +79,8 @@ def test_splat_equals_its_twin_over_seam_and_poles():
     pixels = np.column_stack([across, angles]) * 64 / math.tau
     extents = np.column_stack([*compute_pixels(center, 64), pixels]).astype(np.float32)
     axes = axes_of_pixels(64)
-    depth, sums = np.full((32, 64), np.inf, np.float32), np.zeros((32, 64, 5), np.float32)
+    depth = np.full((32, 64), np.inf, np.float32)
+    sums = np.zeros((32, 64, 5), np.float32)
     packed = pack_points(center.astype(np.float32), rgb).rgbx
     for lo in (0, 11):  # two strips of rows
         part = slice(lo, 11 if lo == 0 else 32)
@@ -126,7 +127,8 @@ def test_holes_are_marked_where_points_are_missing_and_nowhere_else(points, tilt
     surface = pose.center_world + rays * true_ranges[..., None]
     low = points.z.max() - 0.1  # the ceiling: nothing is behind it
     picture = render_points(points.take(np.flatnonzero(points.z < low)), pose, WIDTH, WORKERS)
-    is_missing, is_there = surface[..., 2] > low, (surface[..., 2] < low) & tilted.is_seen
+    is_missing = surface[..., 2] > low
+    is_there = (surface[..., 2] < low) & tilted.is_seen
     # surfels at the upper end of the walls reach some pixels into it
     inner, other = (cv2.erode(m.astype(np.uint8), np.ones((9, 9))) > 0 for m in (is_missing, is_there))
     assert inner.mean() > 0.1

@@ -40,6 +40,8 @@ from research.synthetic.world import (
     scan_world,
 )
 
+pytestmark = pytest.mark.research
+
 SMALL = np.array([3.0, 3.0, 2.4])
 
 
@@ -89,7 +91,8 @@ def test_same_seed_same_bits_at_any_number_of_threads():
 @pytest.mark.parametrize("variant", ["clean", "tilt"])
 def test_panorama_shows_the_scans_colours_where_the_convention_puts_them(variant):
     """A wrong frame, a mirrored axis or a seam half a turn off would make the colours disagree."""
-    cloud, taken = rooms.room(1)[1], rooms.query(1, variant)
+    cloud = rooms.room(1)[1]
+    taken = rooms.query(1, variant)
     shown = taken.pose, taken.rgb, 180, 0.05
     difference = naive.color_differences(rooms.points_world(1), cloud.colors, *shown)
     assert len(difference) > 0.3 * len(cloud.points)

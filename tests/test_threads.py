@@ -50,7 +50,8 @@ def test_an_error_drops_what_has_not_begun():
 
 
 def test_threads_are_kept_and_work_within_work_is_done_by_the_same_one():
-    workers, both = Workers(2), threading.Barrier(2, timeout=60)
+    workers = Workers(2)
+    both = threading.Barrier(2, timeout=60)
 
     def within(_):
         both.wait()
@@ -65,7 +66,8 @@ def test_threads_are_kept_and_work_within_work_is_done_by_the_same_one():
 
 
 def test_one_callers_work_may_wait_for_anothers():
-    is_done, workers = threading.Event(), Workers(2)
+    is_done = threading.Event()
+    workers = Workers(2)
 
     def other():
         list(workers.map(lambda _: None, range(4), "other"))
@@ -106,14 +108,16 @@ def test_a_burst_of_callers_leaves_no_more_threads_than_the_cores_have_use_for()
 
 
 def test_a_value_is_worked_out_once_whoever_asks():
-    asked, may_end = [], threading.Event()
+    asked = []
+    may_end = threading.Event()
 
     def work():
         asked.append(threading.current_thread())
         may_end.wait(10.0)
         return object()
 
-    once, found = Once(work), []
+    once = Once(work)
+    found = []
     threads = [threading.Thread(target=lambda: found.append(once())) for _ in range(8)]
     for thread in threads:
         thread.start()
@@ -140,7 +144,9 @@ def test_what_is_raised_is_raised_and_asked_again():
 
 
 def test_values_are_worked_out_beside_other_work_and_none_is_left_running():
-    begun, may_end, by = threading.Event(), threading.Event(), []
+    begun = threading.Event()
+    may_end = threading.Event()
+    by = []
 
     def first():
         begun.set()

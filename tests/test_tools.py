@@ -25,6 +25,8 @@ from research.measuring import benchmark, confidence, page, sensitivity, speed
 from research.scene import Query, read_scene, write_queries
 from research.synthetic.world import cut_photo, write_photo
 
+pytestmark = pytest.mark.research
+
 TIER = "process"
 
 DAMAGE = "20% hidden by objects", "half of the sphere masked"

@@ -74,7 +74,8 @@ def test_points_that_are_seen_lie_at_the_front_and_are_bounded(octree):
 
 
 def test_candidates_are_near_every_free_place_and_keep_their_distance(octree):
-    room, origin = rooms.room(1)[0].rooms[0], rooms.room(1)[1].origin_world
+    room = rooms.room(1)[0].rooms[0]
+    origin = rooms.room(1)[1].origin_world
     centers = camera_positions.candidate_centers(octree, Workers(2)) + origin
     rng = np.random.default_rng(0)
     places = room.corner + rng.uniform([0.4, 0.4, 0.8], [*(room.size[:2] - 0.4), 2.0], (300, 3))

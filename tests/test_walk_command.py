@@ -53,7 +53,8 @@ def test_a_walk_is_done_again_from_a_frame_that_was_missing_or_failed(queries, t
     assert [r.status for r in results] == ["localized", "failed", "localized"]
     assert "may be used" in results[1].error
     assert run_localize(*command, "--min-confidence", "0.7") == 3
-    prepared, prepare = [], Walk.prepare
+    prepared = []
+    prepare = Walk.prepare
     monkeypatch.setattr(Walk, "prepare", lambda self, *a: prepared.append(a[1]) or prepare(self, *a))
     assert run_localize(*command) == 0
     assert prepared == frames[1:]

@@ -93,7 +93,8 @@ def test_a_turn_at_its_end_tells_a_twin_corridor_if_the_motion_is_known():
     after = make_key(9, ((6, 0, 0), 5.0), ((40, 6, 0), 5.0))
     unknown = walk_path.build_lattice([before, after], Open(), MOTION).smooth()
     np.testing.assert_allclose(unknown.probabilities[0], 0.5, atol=0.01)
-    after.key, after.arrived = 0, make_pose(6, 0, 0)
+    after.key = 0
+    after.arrived = make_pose(6, 0, 0)
     tracked = walk_path.build_lattice([before, after], Open(), MOTION).smooth()
     assert tracked.probabilities[0][0] > 0.99
     after.key = None
@@ -178,7 +179,8 @@ def test_tracked_frames_are_where_their_key_frame_is_or_are_to_be_tracked_there(
 
 def test_a_tracked_frame_before_a_contradiction_is_less_sure():
     frames = [make_key(0, ((0, 0, 0), 8.0)), make_followed(1, 0, (1, 0, 0)), make_key(2, ((70, 0, 0), 5.0))]
-    frames[2].key, frames[2].arrived = 0, make_pose(2, 0, 0)
+    frames[2].key = 0
+    frames[2].arrived = make_pose(2, 0, 0)
     lattice = walk_path.build_lattice(frames, Open(), MOTION)
     path = lattice.smooth()
     assert _chosen(path) == [0, None, None]
@@ -203,8 +205,10 @@ def test_tracking_is_known_by_way_of_later_key_frames():
         make_key(1, ((1, 0, 0), 5.0), ((31, 0, 0), 5.0), departs=1),
         make_key(2, ((2, 0, 0), 5.0), ((32, 0, 0), 5.0)),
     ]
-    frames[1].key, frames[1].arrived = 0, make_pose(1, 0, 0)
-    frames[2].key, frames[2].arrived = 1, make_pose(32, 0, 0)
+    frames[1].key = 0
+    frames[1].arrived = make_pose(1, 0, 0)
+    frames[2].key = 1
+    frames[2].arrived = make_pose(32, 0, 0)
     begin, end, _ = walk_path.motion_between(frames, 0, 2)
     np.testing.assert_allclose(end.center_world - begin.center_world, [2.0, 0.0, 0.0])
     lattice = walk_path.build_lattice(frames, Open(), MOTION)
@@ -249,7 +253,8 @@ def test_doubtful_frames_that_look_elsewhere_add_up():
     """Each is right with 0.83 by itself; the photos were tracked from each other."""
     frames = [make_key(float(k), ((k, 0, 0), 1.6), ((40 + k, 9 * k, 0), -6.0)) for k in range(4)]
     for k, frame in enumerate(frames[1:]):
-        frame.key, frame.arrived = k, frame.states[0].pose
+        frame.key = k
+        frame.arrived = frame.states[0].pose
     sure = [
         walk_path.build_lattice(frames[:n], Open(), Motion(max_speed=1.0, is_timed=False)).smooth()
         for n in range(1, 5)

@@ -114,7 +114,8 @@ def test_rough_places_are_refined_if_they_leave_another_unsure(probabilities, is
 
 
 def test_frames_that_are_not_sure_are_searched_some_of_each_run():
-    sure, unsure = Ranked([State(_at(0.0), 8.0, 0.5)], np.array([0.99])), NOTHING
+    sure = Ranked([State(_at(0.0), 8.0, 0.5)], np.array([0.99]))
+    unsure = NOTHING
     demand = CoarseToFineSettings().demand
     frames = [Frame(float(k)) for k in range(60)]
     beliefs = [unsure] * 2 + [sure] + [unsure] * 57

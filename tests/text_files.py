@@ -23,9 +23,11 @@ RAW = seeded_cloud(1, num_points=1200)
 
 def placed(yaw, pitch, translation):
     """A PTX matrix: for row vectors, the rotation transposed above the translation."""
-    c, s = math.cos(yaw), math.sin(yaw)
+    c = math.cos(yaw)
+    s = math.sin(yaw)
     about_z = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    c, s = math.cos(pitch), math.sin(pitch)
+    c = math.cos(pitch)
+    s = math.sin(pitch)
     matrix = np.eye(4)
     matrix[:3, :3] = (about_z @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])).T
     matrix[3, :3] = translation
