@@ -17,6 +17,8 @@ from piccolo.geometry.pose_gaussian import PoseGaussian, probability_of_ball
 from piccolo.judge.accuracy_hint import explain_accuracy
 from piccolo.judge.belief import make_belief
 from piccolo.judge.pose_covariance import PoseCovariance
+from piccolo.judge.reasons import Reason
+from piccolo.judge.result_parts import FocalLength
 from piccolo.problem.accuracy import PAPER_ACCURACY, Accuracy, Demand
 from piccolo.problem.settings import CoarseToFineSettings
 
@@ -138,11 +140,16 @@ def test_a_result_says_whether_the_place_is_right_and_whether_it_is_exact():
     belief = make_belief([0.98, 0.01], within=0.3, doubt=0.01)
     told = replace(RESULT, settings=wanted).take_belief(belief, 0.9)
     assert told.status == "not_localized"
-    assert told.place_probability == pytest.approx(0.98 * 0.99)
-    assert told.confidence == pytest.approx(0.3 * told.place_probability)
+    assert told.place_probability == 0.98
+    assert told.confidence == pytest.approx(0.3 * 0.98 * 0.99)
     assert told.hint.endswith("would accept it")
     assert told.hint in told._repr_html_().replace("&#x27;", "'")
     assert told.take_belief(replace(belief, within=1.0), 0.9).hint is None, "it is localized"
+    doubted = told.take_belief(replace(belief, doubt=0.1), 0.9)
+    assert doubted.hint is None, "what was given may be wrong"
+    by_focal = replace(doubted, focal_length=FocalLength(700.0, 9.0, 800.0, 9.0))
+    assert by_focal.hint.endswith(told.hint[-32:]), "what is less exact needs less confirmation"
+    assert told.take_belief(belief.rule_out(Reason.MIRRORED), 0.9).place_probability == 0.0
     assert replace(told, settings={}).hint is None
     assert replace(told, best_pose=None, belief=make_belief([])).place_probability == 0.0
 

@@ -22,7 +22,7 @@ from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result, nothing_found
 from piccolo.judge.result_parts import Alternative, Evidence
 from piccolo.photo import Photo
-from piccolo.problem.accuracy import PAPER_ACCURACY
+from piccolo.problem.accuracy import PAPER_ACCURACY, Accuracy
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.together.walk.frames import MOST_ODDS, Frame, State, list_states
 from piccolo.together.walk.path import NOTHING, Ranked
@@ -161,6 +161,9 @@ def test_a_frame_of_a_walk_is_believed_by_its_path_and_its_errors(std):
     assert found.belief.place[-1] == pytest.approx(0.03)
     assert (found.status == "localized") == (std == 0.01)
     assert len(found.alternatives) == 5
+    tracker.settings = CoarseToFineSettings(accuracy=Accuracy(0.25))
+    wide = make_localization(tracker, Frame(0.0), Ranked(states, np.array([0.92, *[0.01] * 8])))
+    assert (wide.status, wide.place_probability) == ("localized", found.place_probability)
 
 
 def test_a_frame_that_is_sure_beyond_reach_of_the_walk_is_told_but_not_believed():

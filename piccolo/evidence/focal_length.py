@@ -22,6 +22,7 @@ from ..geometry.pose import Pose, rotate_points
 from ..geometry.pose_gaussian import PoseGaussian, add
 from ..geometry.sphere import compute_indices
 from ..jobs.threads import Workers
+from ..judge.belief import UNCONFIRMED
 from ..judge.candidate import Candidate
 from ..judge.claim import Claim, marginal
 from ..judge.consensus import WRONG_DEVIATION, WRONG_SHARE, Opinion
@@ -65,7 +66,6 @@ MOST_VARIANCE = 1.0  # of a focal length's logarithm: with more, the picture say
 FOCAL_WIDTHS = (0.5, *CALIBRATED)
 ALL_WIDTHS = (0.1, 0.05, 0.02, 0.02, 0.1)
 DISAGREE = 2.0  # deviations between picture and what was given, by which chance parts them in one of twenty
-UNCONFIRMED = 0.1  # chosen: weight of a photo's own focal length, against the one given, in what it confirms
 AT_REST = 0.5  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
 EDGE_WIDTH = 17  # [px] of the sphere, around a point that shows nothing beyond the picture

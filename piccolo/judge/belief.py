@@ -14,6 +14,8 @@ from ..arrays import Array
 from .probability import NOT_LOCALIZED, classify
 from .reasons import Reason
 
+UNCONFIRMED = 0.1  # chosen: doubt of what was given, where the photo can't confirm it as exactly as is wanted
+
 
 @dataclass(frozen=True)
 class Belief:
@@ -23,6 +25,11 @@ class Belief:
     within: float = 1.0  # that the best pose is as exact as wanted if its place is right
     doubt: float = 0.0  # that what was given of the photo's geometry is wrong
     ruled_out: frozenset[Reason] = frozenset()  # why no pose is right, whatever others say
+
+    @property
+    def best_place(self) -> float:
+        """Probability that the place of the best pose is right; 0 without one, and if it is ruled out."""
+        return 0.0 if self.ruled_out or len(self.place) < 2 else self.place[0]
 
     @property
     def sound_places(self) -> Array:

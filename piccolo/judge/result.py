@@ -18,7 +18,7 @@ from ..geometry.sphere import CONVENTION
 from ..photo import GpsPrior
 from ..problem.accuracy import Accuracy, Demand
 from .accuracy_hint import explain_accuracy
-from .belief import NOTHING, Belief, decide
+from .belief import NOTHING, UNCONFIRMED, Belief, decide
 from .pose_covariance import PoseCovariance
 from .probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED, Standing
 from .result_parts import Alternative, Beside, Evidence, FocalLength, Source, SphereGeometry, WalkFrame
@@ -171,8 +171,7 @@ class Result:
     @property
     def place_probability(self) -> float:
         """Probability that the place of `best_pose` is right, however exact it is; 0 without a pose."""
-        is_believed = len(self.belief.place) > 1
-        return float(self.belief.sound_places[0]) if is_believed else 0.0
+        return self.belief.best_place
 
     @property
     def hint(self) -> str | None:
@@ -180,8 +179,11 @@ class Result:
         asked = self.settings.get("accuracy")
         if self.status == LOCALIZED or self.covariance is None or not asked:
             return None
+        doubt = self.belief.doubt
+        if self.focal_length is not None:  # what a photo can't confirm is less if it needn't be so exact
+            doubt = max(1.0 - (1.0 - doubt) / (1.0 - UNCONFIRMED), 0.0)
         demand = Demand(Accuracy(**asked), self.settings["min_confidence"])
-        return explain_accuracy(self.place_probability, self.covariance, demand)
+        return explain_accuracy(self.place_probability * (1.0 - doubt), self.covariance, demand)
 
     @property
     def cloud_name(self) -> str:
