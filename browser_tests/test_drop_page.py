@@ -41,6 +41,16 @@ LISTEN = """() => {
   };
 }"""
 
+# says of photos that another helped them
+WITH_HELPER = """() => {
+  const { get } = Object.getOwnPropertyDescriptor(XMLHttpRequest.prototype, "responseText");
+  Object.defineProperty(XMLHttpRequest.prototype, "responseText", {
+    get() {
+      return get.call(this).replaceAll('"beside": []', '"beside": ["phone.jpg"]');
+    },
+  });
+}"""
+
 WITHOUT_PICTURES = """() => {
   const { get } = Object.getOwnPropertyDescriptor(XMLHttpRequest.prototype, "responseText");
   Object.defineProperty(XMLHttpRequest.prototype, "responseText", {
@@ -166,6 +176,36 @@ def test_panorama_phone_photo_and_photo_of_another_place(visit, elsewhere, shoot
     page.click("text=Take off the list")
     page.wait_for_selector("body:not(.viewing)")
     assert _names(page) == ["living_room", "phone", "bedroom"]
+
+
+def test_photos_of_one_spot_are_sent_together(visit, tmp_path, shoot):
+    """One request has all of them, and each says what was found of it, and with which."""
+    page = visit()
+    page.evaluate(LISTEN)
+    page.evaluate(WITH_HELPER)
+    asked = []
+    page.on("request", lambda request: asked.append(request.url))
+    notes = tmp_path / "notes.jpg"
+    notes.write_bytes(b"no picture")
+    page.check("input[name=together]")
+    shoot(page, "drop-together")
+    _choose(page, FLAT / "images" / "living_room.jpg", notes, FLAT / "images" / "phone.jpg")
+    _wait(page, "localized", "unreadable", "localized")
+    assert [url.endswith("/show") for url in asked].count(True) == 1
+    assert page.evaluate("told.together")
+    page.click("#row-0")
+    page.wait_for_selector("#facts dd >> text=phone.jpg")
+    assert page.locator("#facts dt >> text=Found with").is_visible()
+    shoot(page, "drop-together-found")
+    page.click("#row-1")
+    page.wait_for_selector("#facts >> text=wanted a whole JPEG")
+    page.uncheck("input[name=together]")
+    with _answering(page, lambda route: route.abort()):
+        _choose(page, FLAT / "images" / "bedroom.jpg", FLAT / "images" / "phone.jpg")
+        page.wait_for_selector("#row-3 >> text=The connection")
+        page.wait_for_selector("#row-4 >> text=The connection")
+    assert [url.endswith("/show") for url in asked].count(True) == 3
+    assert page.evaluate("told.together") is None
 
 
 def test_the_export_keeps_names(visit, tmp_path):

@@ -3,6 +3,7 @@
 import json
 import math
 
+import cv2
 import numpy as np
 import pytest
 import rooms
@@ -14,8 +15,10 @@ from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli.localize import main
 from piccolo.opening import open_scan
+from piccolo.panorama.video import choose_distinct
 from piccolo.photo import Photo, Prior
 from piccolo.result_files import read_results
+from research.synthetic.walk_frames import writing_video
 from research.synthetic.world import render_picture
 
 TIER = "scene"
@@ -136,6 +139,42 @@ def test_a_batch_looks_at_photos_that_are_not_sure_together(folder, tmp_path, ca
     for answer, line in zip(map(untimed_line, body.decode().splitlines()), lines, strict=True):
         assert answer | {"pano": line["pano"], "beside": line["beside"]} == line
         assert (answer["beside"] or {}).get("is_together") == (line["beside"] or {}).get("is_together")
+
+
+def test_a_film_of_one_place_is_its_frames_together(folder, tmp_path, capsys):
+    """A camera shows each of three views for half a second."""
+    film = tmp_path / "film.mp4"
+    with writing_video(film, 2.0, SIZE) as add:
+        for k in range(3):
+            add(cv2.imread(str(folder / f"{k}.png"))[..., ::-1])
+    words = _command(folder, "--together", "--overwrite", "--out", tmp_path / "poses.jsonl")
+    begin = words.index("--pano")
+    words[begin : begin + 2] = ["--video", str(film)]
+    main(words)
+    results = read_results([tmp_path / "poses.jsonl"])
+    assert [one.pano for one in results] == [f"{film}#t={time}" for time in ("0.000", "0.500", "1.000")]
+    assert [one.status for one in results].count("localized") >= 2
+    named = {name for one in results if one.beside for name in one.beside.photos}
+    assert named
+    assert named <= {one.pano for one in results}
+    assert "3 photos together in" in capsys.readouterr().err
+    assert main([*words, "--max-speed", "2"]) == 2
+    assert "--max-speed: not with --together: its photos are in no order" in capsys.readouterr().err
+
+
+def test_of_many_frames_those_are_taken_between_which_the_picture_changes(tmp_path):
+    """A camera stands still, turns, and stands still again."""
+    rng = np.random.default_rng(0)
+    wall = cv2.resize(rng.integers(0, 255, (30, 160), np.uint8), (2560, 480))
+    at = [0] * 10 + [200 * k for k in range(10)] + [1800] * 10
+    paths = [tmp_path / f"{k:02d}.jpg" for k in range(len(at))]
+    for path, left in zip(paths, at, strict=True):
+        cv2.imwrite(str(path), wall[:, left : left + 640])
+    assert choose_distinct(paths, 30) == list(range(30))
+    chosen = choose_distinct(paths, 8)
+    assert len(chosen) == 8
+    assert (at[chosen[0]], at[chosen[-1]]) == (0, 1800)
+    assert [at[k] for k in chosen] == sorted({at[k] for k in chosen}), "no view twice"
 
 
 @pytest.mark.parametrize("options", [["--walk"], ["--relative", "poses.txt"], ["--jobs", "2"], ["--labels"]])

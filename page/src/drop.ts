@@ -15,6 +15,8 @@ const AT_ONCE = 2;
 const STEP = 5; // percent
 const TRIES = 6; // of a photo that a busy service sends away
 const FOV = "65"; // degrees, of most phones
+const MOST_TOGETHER = 48; // photos in a request; the service reads 64
+const FORM_BYTES = 1000; // about a photo in a request
 const NARROW = "(max-width: 860px)";
 const ENDING = /\.[A-Za-z0-9]{3,4}( \(\d+\))?$/;
 const NONE = ["probabilityNone", "accuracy", "hint", "scan", "captured", "size", "walk", "time", "pose", "storey", "height", "evidence", "spread"];
@@ -25,6 +27,8 @@ interface Job {
   file: File;
   photo: Photo;
   options: Options;
+  /** The photos that are sent with it, it among them. */
+  party: Job[];
   state: "queued" | "sent" | "resting" | "done";
   tries: number;
   stop: AbortController;
@@ -39,6 +43,7 @@ export class Drop {
   private opened: Photo | null = null;
   private last: Job | null = null;
   private count = 0;
+  private readonly together = h("input", { type: "checkbox", name: "together" });
   private readonly told = h("div", { class: "told", role: "status" });
   /** Of the photos at work, where the list is out of sight. */
   private readonly progress = h("div", { class: "progress" });
@@ -88,6 +93,7 @@ export class Drop {
       h("h2", {}, words.title),
       h("p", {}, (isTouched ? words.leadOfTouch : words.lead)(words.megabytes(maxBytes))),
       h("div", { class: "copies" }, ...buttons),
+      h("label", { class: "spot" }, this.together, h("span", {}, words.together)),
       this.told,
       h("p", { class: "quiet" }, this.keeps ? words.kept : words.notKept),
       files,
@@ -134,10 +140,14 @@ export class Drop {
 
   private add(files: File[]): void {
     const most = this.model.report.service!.maxBytes;
+    let party: Job[] = [];
     for (const file of files) {
       const { options } = this;
       const photo = this.blank(file, isImage(file) ? URL.createObjectURL(file) : null);
-      const job: Job = { file, options, photo, state: "queued", tries: 0, stop: new AbortController() };
+      const size = party.reduce((sum, one) => sum + one.file.size + FORM_BYTES, file.size);
+      if (!this.together.checked || size > most || party.length >= MOST_TOGETHER) party = [];
+      const job: Job = { file, options, photo, party, state: "queued", tries: 0, stop: new AbortController() };
+      party.push(job);
       this.jobs.push(job);
       this.model.put(job.photo);
       if (file.size <= most) continue;
@@ -153,7 +163,7 @@ export class Drop {
     for (let k = 2; isTaken(name); k++) name = `${file.name} (${k})`;
     return {
       ...(Object.fromEntries(NONE.map((key) => [key, null])) as unknown as Photo),
-      ...{ gap: false, isOnPlan: false, hasPictures: false, confidence: 0, placeProbability: 0, warnings: [], contradicts: [], alternatives: [] },
+      ...{ gap: false, isOnPlan: false, hasPictures: false, confidence: 0, placeProbability: 0, warnings: [], contradicts: [], alternatives: [], beside: [] },
       ...{ name, short: name.replace(ENDING, "$1"), key: `dropped-${this.count++}` },
       ...{ status: "waiting", error: words.queued, thumb },
     };
@@ -172,16 +182,37 @@ export class Drop {
   }
 
   private next(): void {
-    const free = AT_ONCE - this.jobs.filter(({ state }) => state === "sent").length;
-    for (const job of this.jobs.filter(({ state }) => state === "queued").slice(0, free)) void this.run(job);
+    const parties = [...new Set(this.jobs.map(({ party }) => party))];
+    const isAtWork = (party: Job[]) => party.some(({ state }) => state === "sent" || state === "resting");
+    const isAsked = (party: Job[]) => party.some(({ state }) => state === "queued") && !isAtWork(party);
+    const free = AT_ONCE - parties.filter((party) => party.some(({ state }) => state === "sent")).length;
+    for (const party of parties.filter(isAsked).slice(0, Math.max(free, 0))) {
+      void this.run(party.filter(({ state }) => state === "queued"));
+    }
   }
 
-  private async run(job: Job): Promise<void> {
-    job.state = "sent";
-    this.replace(job, { error: words.sending(0) });
+  /** Send photos in one request; of a told lens nothing is said of spheres, which are sent by themselves. */
+  private async run(jobs: Job[]): Promise<void> {
+    for (const job of jobs) {
+      job.state = "sent";
+      this.replace(job, { error: words.sending(0) });
+    }
+    const areSpheres = await Promise.all(jobs.map(isSphere));
+    const stop = new AbortController();
+    for (const isOne of [false, true]) {
+      const own = jobs.filter((job, index) => areSpheres[index] === isOne && this.jobs.includes(job));
+      if (!own.length) continue;
+      own.forEach((job) => job.stop.signal.addEventListener("abort", () => own.every((one) => one.stop.signal.aborted) && stop.abort()));
+      const options = asJson(own[0].options, isOne, own.length > 1);
+      const photos = own.map(({ file, photo }): [File, string] => [file, own.length > 1 ? photo.name : file.name]);
+      const answers = send(photos, options, stop.signal, (part) => own.forEach((job) => this.tell(job, part)));
+      own.forEach((job, index) => void this.take(job, answers[index]));
+    }
+  }
+
+  private async take(job: Job, answer: Promise<Found>): Promise<void> {
     try {
-      const options = asJson(job.options, await isSphere(job));
-      const found = await send(job.file, options, job.stop.signal, (part) => this.tell(job, part));
+      const found = await answer;
       if (this.jobs.includes(job)) this.show(job, found);
     } catch (error) {
       if (this.jobs.includes(job)) this.refuse(job, error instanceof Refusal ? error : new Refusal(LOST, String(error)));
@@ -226,7 +257,7 @@ export class Drop {
     if (refusal.seconds !== null && ++job.tries < TRIES) {
       job.state = "resting";
       this.replace(job, { error: words.busy(refusal.seconds) });
-      setTimeout(() => job.state === "resting" && this.queue(job), 1000 * refusal.seconds);
+      setTimeout(() => job.state === "resting" && this.queue([job]), 1000 * refusal.seconds);
       return;
     }
     const error = refusal.needsField ? words.needsFieldWhy : refusal.message.replace(`${job.file.name}: `, "");
@@ -252,18 +283,20 @@ export class Drop {
     this.model.select(this.model.report.photos.indexOf(photo));
   }
 
-  private queue(job: Job): void {
-    if (!this.jobs.includes(job)) return; // taken off the list meanwhile
-    delete window.PICCOLO_PHOTOS?.[job.photo.key]; // its text is large
-    job.state = "queued";
-    job.refusal = undefined;
-    job.result = undefined;
-    this.replace(job, { ...this.blank(job.file, job.photo.thumb), verdict: undefined, name: job.photo.name, short: job.photo.short });
+  private queue(jobs: Job[]): void {
+    for (const job of jobs.filter((one) => this.jobs.includes(one))) { // others were taken off the list meanwhile
+      delete window.PICCOLO_PHOTOS?.[job.photo.key]; // its text is large
+      job.state = "queued";
+      job.refusal = undefined;
+      job.result = undefined;
+      this.replace(job, { ...this.blank(job.file, job.photo.thumb), verdict: undefined, name: job.photo.name, short: job.photo.short });
+    }
     this.next();
   }
 
   private remove(job: Job): void {
     job.stop.abort();
+    job.party.splice(job.party.indexOf(job), 1);
     this.jobs = this.jobs.filter((other) => other !== job);
     delete window.PICCOLO_PHOTOS?.[job.photo.key];
     this.model.remove(job.photo);
@@ -282,9 +315,11 @@ export class Drop {
     const known = refusal?.needsField ? { fov: FOV, ...job.options } : job.options;
     const advice = isUnsure ? (photo.hint ? words.lessExact : words.notSure) : refusal && adviceOn(refusal);
     const retry = (options: Options) => {
-      job.options = options;
-      job.tries = 0;
-      this.queue(job);
+      for (const one of job.party) {
+        one.options = options;
+        one.tries = 0;
+      }
+      this.queue(job.party.filter((one) => one.state === "done"));
     };
     const buttons = h(
       "div",

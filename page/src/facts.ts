@@ -109,6 +109,7 @@ export class Facts {
     if (storey !== null && storeys[storey]) rows.push([text.storey, storeys[storey].name]);
     if (photo.height !== null) rows.push([text.height, `${photo.height.toFixed(2)} m`]);
     if (photo.scan) rows.push([text.inScan, photo.scan]);
+    if (photo.beside.length) rows.push([text.helpers, photo.beside.join(", ")]);
     const json = () => JSON.stringify({ R_cam_from_world: chunked(pose.worldRotation), center_world: pose.world });
     const buttons = h(
       "div",

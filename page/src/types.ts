@@ -66,6 +66,8 @@ export interface Photo {
   /** In place of the words for its status, if these are too wide. */
   verdict?: string;
   scan: string | null;
+  /** Names of the photos by which it was found too. */
+  beside: string[];
   captured: string | null;
   size: [number, number] | null;
   walk: number | null;

@@ -30,7 +30,7 @@ from ..scan_bundle import AskedPosed, localize_posed
 from ..scan_group import OF_RESULTS, AskedTogether, localize_photos_together
 from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
-from .localizer import Localizer
+from .localizer import Localizer, rename
 from .relative_poses import find_scale, read_relative_poses
 from .results_file import WAYS, Records
 
@@ -126,9 +126,13 @@ def make_bundle_job(
     return Job("photos together", {photo.name: photo for photo, _ in asked}, fields, run)
 
 
-def make_group_job(localizer: Localizer, scan: Scan, photos: Sequence[Path], write_steps: WriteSteps) -> Job:
-    """Return the job of localizing photos of one place together; it has no steps."""
-    asked = [localizer.ask(path) for path in photos]
+def make_group_job(
+    localizer: Localizer, scan: Scan, photos: Sequence[tuple[str, Path]], write_steps: WriteSteps
+) -> Job:
+    """Return the job of localizing photos of one place together, by names and paths; it has no steps."""
+    asked = [localizer.ask(Path(name)) for name, _ in photos]
+    asked = [(replace(one, picture=path), more) for (one, more), (_, path) in zip(asked, photos, strict=True)]
+    names = {str(path): name for name, path in photos}
     traces = [Trace(localizer.is_traced) for _ in photos]
 
     def run(_journal: Journal) -> list[Result]:
@@ -138,13 +142,14 @@ def make_group_job(localizer: Localizer, scan: Scan, photos: Sequence[Path], wri
             for (photo, settings), trace in zip(asked, traces, strict=True)
             if isinstance(settings, CoarseToFineSettings)
         ]
-        results = localize_photos_together(scan_map, scan.reader, scan.workers, together)
+        found = localize_photos_together(scan_map, scan.reader, scan.workers, together)
+        results = [rename(result, names) for result in found]
         for result, trace in zip(results, traces, strict=True):
             write_steps(result.pano, trace.steps)
         return results
 
     fields = localizer.expect(scan.prepared.scan_sha256, OF_RESULTS)
-    return Job("photos together", {photo.name: photo for photo, _ in asked}, fields, run)
+    return Job("photos together", {names[photo.name]: photo for photo, _ in asked}, fields, run)
 
 
 def make_coloring_job(

@@ -1,7 +1,6 @@
 """Answers to the photos of a batch, in this process or where else the scan is opened."""
 
 import json
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -62,15 +61,16 @@ class Task(NamedTuple):
             write_temporary(path, content)
 
 
-def rename(result: Result, folder: str) -> Result:
-    """Return a result without the path of a temporary folder in the names of photos."""
+def rename(result: Result, names: Mapping[str, str]) -> Result:
+    """Return the result of a photo in a temporary folder with the names of photos in place of their paths."""
+    path = result.pano
+    name = names[path]
     beside = result.beside
     if beside is not None:
-        beside = replace(beside, photos=tuple(name.removeprefix(folder) for name in beside.photos))
-    warnings = tuple(warning.replace(folder, "") for warning in result.warnings)
-    error = result.error and result.error.replace(folder, "")
-    pano = result.pano.removeprefix(folder)
-    return replace(result, pano=pano, beside=beside, warnings=warnings, error=error)
+        beside = replace(beside, photos=tuple(names[photo] for photo in beside.photos))
+    warnings = tuple(warning.replace(path, name) for warning in result.warnings)
+    error = result.error and result.error.replace(path, name)
+    return replace(result, pano=name, beside=beside, warnings=warnings, error=error)
 
 
 def files_of(pano: Path) -> dict[str, bytes]:
@@ -220,7 +220,8 @@ class Localizer:
                     AskedTogether(replace(task.photo, picture=folder / task.photo.path), task.settings)
                 )
             found = localize_photos_together(scan_map, scan.reader, scan.workers, asked)
-            return [rename(result, f"{folder}{os.sep}") for result in found]
+            names = {one.photo.name: task.photo.name for one, task in zip(asked, tasks, strict=True)}
+            return [rename(result, names) for result in found]
 
     def give_up(self, task: Task, error: WorkerLostError, cloud_sha256: str | None) -> Answer:
         """Return the answer to a task whose workers were lost."""

@@ -175,7 +175,8 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
     option(group, "--together", text + "those that show the same are localized together, in any order")
     text = "the photos are frames of one walk, in this order, and constrain each other"
     option(group, "--walk", text)
-    option(group, "--video FILE ...", "video of a walk, or its chapters in order, instead of --pano")
+    text = "video of a walk, or with --together of one place, or its chapters in order, instead of --pano"
+    option(group, "--video FILE ...", text)
     text = "seconds from one frame of a video to the next, the sharpest around each time "
     option(group, "--every S", f"{text}(default {DEFAULT_EVERY})")
     text = f"times of the frames: {EXIF}, {NAMES} (the last number in each name [s]), {ORDER}, or CSV file "

@@ -321,13 +321,17 @@ def run_jointly(run: Run) -> int:
     photos = list(run.panoramas)
     steps_of = partial(write_steps, run)
     with ExitStack() as stack:
-        if arguments.walk or arguments.video:
+        if together.is_walk(arguments):
             taken = together.walk_frames(arguments, localizer.photo, photos)
             frames, motion = stack.enter_context(taken)
             if run.left_out:
                 arguments.note(describe_left_out(run.left_out))
             scan = open_scan(run, localizer, arguments.threads or num_cores())
             asked = together.ask_for_walk(arguments, frames, scan, motion, steps_of)
+        elif arguments.video:
+            shown = stack.enter_context(together.distinct_frames(arguments))
+            scan = open_scan(run, localizer, arguments.threads or num_cores())
+            asked = together.ask_together(arguments, shown, localizer, scan, steps_of)
         else:
             scan = open_scan(run, localizer, arguments.threads or num_cores())
             asked = together.choose_job(arguments)(arguments, photos, localizer, scan, steps_of)

@@ -29,10 +29,11 @@ from ..jobs.interruption import Interruption
 from ..jobs.processes import Pair
 from ..judge.result import Result
 from ..panorama.photo import sha256_of
-from ..panorama.video import frames_of_chapters
+from ..panorama.video import choose_distinct, frames_of_chapters
 from ..photo import Photo
 from ..scan import Scan
 from ..scan_walk import Walk
+from ..together.series import MOST_IN_SERIES
 from ..together.walk.frames import Motion
 from . import terminal
 from .command import Arguments, UsageError
@@ -43,6 +44,7 @@ KNOWN = "their camera must be known: refine it with a single photo"
 IN_TURN = "its frames come one after another"
 AS_ONE = "its photos are weighed as one camera, in one process"
 IN_GROUPS = "which photos belong together is decided in one process"
+NO_WALK = "its photos are in no order, so no way between them is followed"
 NO_COLORS = "labels are no colours"
 IN_ROUNDS = "a photo needs the colours of all others"
 OTHER = "photos are localized together in one way"
@@ -58,6 +60,8 @@ NOT_WITH: Mapping[str, Mapping[str, str]] = {  # options that do not go with wha
     "--together": {
         "walk": OTHER,
         "relative": OTHER,
+        "max_speed": NO_WALK,
+        "odometry": NO_WALK,
         "jobs": IN_GROUPS,
         "dask": IN_GROUPS,
         "labels": NO_COLORS,
@@ -97,10 +101,15 @@ def check_joint_options(arguments: Arguments) -> None:
     Motion(max_speed=a.max_speed)  # refuses a wrong one
 
 
+def is_walk(arguments: Arguments) -> bool:
+    """Return True if frames are to be followed one after another."""
+    return arguments.walk or bool(arguments.video and not arguments.together)
+
+
 def refuse_others(arguments: Arguments) -> None:
     """Refuse options that do not go with what is asked for, and say why."""
     a = arguments
-    asked = {"a video": a.video, "a walk": a.walk or a.video, "--relative": a.relative}
+    asked = {"a video": a.video, "a walk": is_walk(a), "--relative": a.relative}
     asked |= {"--together": a.together, "--color-scan": a.color_scan}
     for what in (what for what, is_asked in asked.items() if is_asked):
         for name, why in NOT_WITH[what].items():
@@ -164,7 +173,18 @@ def ask_for_bundle(
 def ask_for_group(
     arguments: Arguments, photos: Sequence[Path], localizer: Localizer, scan: Scan, write_steps: WriteSteps
 ) -> Printed:
-    """Return the job of --together."""
+    """Return the job of --together for photos."""
+    return ask_together(arguments, [(str(path), path) for path in photos], localizer, scan, write_steps)
+
+
+def ask_together(
+    arguments: Arguments,
+    photos: Sequence[tuple[str, Path]],
+    localizer: Localizer,
+    scan: Scan,
+    write_steps: WriteSteps,
+) -> Printed:
+    """Return the job of --together for photos by their names, or the frames of a video."""
 
     def report(results: Sequence[Result]) -> tuple[str, bool]:
         print_each(arguments, scan, results)
@@ -204,6 +224,25 @@ def choose_job(arguments: Arguments) -> Callable[..., Printed]:
     return ask_for_group if arguments.together else ask_for_coloring
 
 
+def read_video(arguments: Arguments, folder: Path) -> Iterator[tuple[Path, float, str]]:
+    """Yield the frames of a video as files in a folder, with their times and names."""
+    taken = frames_of_chapters(arguments.video, arguments.every or DEFAULT_EVERY, folder)
+    bar = {"desc": "read the video", "unit": " frames", "leave": False}
+    for video, frame, time in terminal.show_progress(taken, arguments.quiet, **bar):
+        yield frame.path, time, f"{video}#t={frame.time:.3f}"
+
+
+@contextmanager
+def distinct_frames(arguments: Arguments) -> Iterator[list[tuple[str, Path]]]:
+    """Yield names and files of the frames of a video, of many those that differ most, until the end."""
+    with temporary_folder() as folder:
+        frames = [(name, path) for path, _, name in read_video(arguments, folder)]
+        chosen = choose_distinct([path for _, path in frames], MOST_IN_SERIES)
+        if len(chosen) < len(frames):
+            arguments.note(f"took {len(chosen)} of {len(frames)} frames, between which the picture changes")
+        yield [frames[k] for k in chosen]
+
+
 @contextmanager
 def walk_frames(
     arguments: Arguments, photo: Photo, panoramas: Sequence[Path]
@@ -211,16 +250,14 @@ def walk_frames(
     """Yield the frames of a walk, those of a video as files until the end, and how the camera was carried."""
     with temporary_folder() if arguments.video else nullcontext(Path()) as folder:
         times = None
+        found: Iterable[tuple[Path, float, str]]
         if arguments.video:
-            taken = frames_of_chapters(arguments.video, arguments.every or DEFAULT_EVERY, folder)
-            bar = {"desc": "read the video", "unit": " frames", "leave": False}
-            shots = terminal.show_progress(taken, arguments.quiet, **bar)
-            found = ((f.path, time, f"{video}#t={f.time:.3f}") for video, f, time in shots)
+            found = read_video(arguments, folder)
         else:
             times = times_of(panoramas, arguments.times)
             clock = times or [float(k) for k in range(len(panoramas))]
             found = ((p, t - clock[0], str(p)) for p, t in zip(panoramas, clock, strict=True))
-        frames = [WalkInput(replace(photo, picture=path), *more) for path, *more in found]
+        frames = [WalkInput(replace(photo, picture=path), time, name) for path, time, name in found]
         if arguments.odometry:
             paths = [frame.photo.path for frame in frames]
             when = times or [frame.time for frame in frames]

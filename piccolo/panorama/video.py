@@ -1,6 +1,7 @@
 """Videos: their frames as picture files, the sharpest around each time step."""
 
 from collections.abc import Collection, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from ..jobs.memory import check_memory
 
 SHARPNESS_WIDTH = 512  # [px] at which sharpness is judged
 NEIGHBORHOOD = 0.25  # of a step, before and after its time, in which the sharpest frame is taken
+DISTINCT_SIZE = 32, 18  # [px] at which it is judged how much a picture changes
 FRAME_QUALITY = 95  # of the JPEG files
 FRAME_BYTES_PER_PIXEL = 20  # of frames in several stages of decoding; 19 were measured
 WANTED = "wanted a video that PyAV reads, such as MP4"
@@ -69,6 +71,19 @@ def frames_at(video: Path, times: Collection[float], folder: Path) -> Iterator[V
             yield _write_frame(video, folder, time, _upright(frame))
         if not left:
             return
+
+
+def choose_distinct(frames: Sequence[Path], most: int) -> list[int]:
+    """List the numbers of frames between which the picture changes about evenly, `most` of them or fewer.
+
+    The first and the last are among them; where a camera stands still, or waits, there are few.
+    """
+    if len(frames) <= most:
+        return list(range(len(frames)))
+    shown = (np.asarray(cv2.imread(str(frame), cv2.IMREAD_REDUCED_GRAYSCALE_8)) for frame in frames)
+    small = [cv2.resize(gray, DISTINCT_SIZE, interpolation=cv2.INTER_AREA).astype(float) for gray in shown]
+    along = np.cumsum([0.0, *(np.abs(after - before).mean() for before, after in pairwise(small))])
+    return sorted({int(np.abs(along - at).argmin()) for at in np.linspace(0.0, along[-1], most)})
 
 
 def measure_sharpness(rgb: Bytes) -> float:

@@ -115,6 +115,7 @@ def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> d
         "contradicts": contradicts,
         "isOnPlan": result.best_pose is not None and not is_hopeless,
         "scan": result.scan,
+        "beside": [printable(Path(photo).name) for photo in (result.beside.photos if result.beside else ())],
         "captured": result.source.capture_time,
         "size": result.source.image_size,
         "walk": entry.walk,
