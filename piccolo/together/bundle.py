@@ -91,7 +91,7 @@ def localize_bundle(
     `errors` are those expected of the poses; their scale is unknown if its deviation is large.
     """
     shots = [Shot(one.panorama, one.settings, one.trace) for one in posed]
-    alone, found = find_members(scan_map, shots, workers, watch)
+    alone, found, _ = find_members(scan_map, shots, workers, watch)
     cams = move_origin_near([one.cam_from_bundle for one in posed])
     members = {k: PosedMember(member.found, member.alone, cams[k]) for k, member in sorted(found.items())}
     settings = posed[0].settings

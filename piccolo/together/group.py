@@ -71,8 +71,7 @@ def localize_group(
     """
     contents = [sha256(shot.panorama.rgb.tobytes()).digest() for shot in shots]
     order = sorted(range(len(shots)), key=contents.__getitem__)  # results depend on no other
-    sorted_shots = [shots[k] for k in order]
-    alone, members = find_members(scan_map, sorted_shots, workers, watch)
+    alone, members, asked = find_members(scan_map, [shots[k] for k in order], workers, watch)
     grouped = {k: Grouped(one, ()) for k, one in enumerate(alone)}
     matched = {k: one for k, one in members.items() if one.found.problem.profile.uses_matches}
     if matched:
@@ -80,7 +79,7 @@ def localize_group(
         with watch.stage("refine"):
             means = Means(settings.effort, workers, watch)
             grouped |= localize_linked(matched, means, settings.demand)
-            grouped |= localize_rest(scan_map, sorted_shots, {k: grouped[k] for k in matched}, means)
+            grouped |= localize_rest(scan_map, asked, {k: grouped[k] for k in matched}, means)
     return [
         Grouped(grouped[k].result, tuple(sorted(order[other] for other in grouped[k].others)))
         for k in np.argsort(order)

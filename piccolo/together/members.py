@@ -76,17 +76,20 @@ class Shot(NamedTuple):
 
 def find_members(
     scan_map: ScanMap, shots: Sequence[Shot], workers: Workers, watch: Stopwatch
-) -> tuple[list[Result], dict[int, Member]]:
+) -> tuple[list[Result], dict[int, Member], list[Shot]]:
     """Find each of several photos by itself.
 
     Those that are not sure are found again with the focal length that those that are sure tell of their
-    camera. Returns the result of each photo alone, and those that were searched by their numbers.
+    camera. Returns the result of each photo alone, those that were searched by their numbers, and all photos
+    as they were asked last.
     """
     alone = [nothing_found() for _ in shots]
     members: dict[int, Member] = {}
+    asked = list(shots)
 
     def find_each(numbered: Iterable[tuple[int, Shot]]) -> None:
         for k, shot in numbered:
+            asked[k] = shot
             member = find_alone(scan_map, shot, workers, watch)
             if member is None:
                 alone[k] = explain_nothing(scan_map, shot.panorama, shot.settings.prior)
@@ -99,7 +102,7 @@ def find_members(
         numbers = [k for k, shot in enumerate(shots) if shot.camera == camera]
         expected = expect_focal([shots[k].panorama for k in numbers], [alone[k] for k in numbers])
         find_each((numbers[n], shots[numbers[n]]._replace(panorama=one)) for n, one in expected.items())
-    return alone, members
+    return alone, members, asked
 
 
 def find_alone(scan_map: ScanMap, shot: Shot, workers: Workers, watch: Stopwatch) -> Member | None:
