@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from refusals import assert_input_error
-from test_result import RESULT
+from results import RESULT
 
 from piccolo.cli.command import new_parser, parse
 from piccolo.cli.options import add_arguments
