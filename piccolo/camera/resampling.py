@@ -51,7 +51,8 @@ def make_sphere(views: Sequence[View], width: int) -> Pixels:
     Where several cameras show the same, the one is taken whose axis is nearest; how far they are from each
     other is left aside.
     """
-    rgb = np.zeros((width // 2, width, 3), np.uint8)
+    rgb = np.zeros((width // 2, width, 3), np.uint8)  # what is not written mostly takes no memory
+    is_shown = np.zeros((width // 2, width), np.bool_)
     nearest = np.full((width // 2, width), -2.0, np.float32)  # cosine of the angle to the axis
     for view in (shrunk(view, width) for view in views):
         axis = view.mount.rotation[0]
@@ -65,7 +66,8 @@ def make_sphere(views: Sequence[View], width: int) -> Pixels:
             is_better = is_valid & (closeness > nearest[block])
             np.copyto(rgb[block], pixels, where=is_better[..., None])
             np.copyto(nearest[block], closeness, where=is_better)
-    return rgb, nearest > -2.0
+            is_shown[block] |= is_better
+    return rgb, is_shown
 
 
 def shrunk(view: View, width: int = MAX_RESAMPLED_WIDTH) -> View:

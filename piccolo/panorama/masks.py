@@ -237,6 +237,8 @@ def read_mask(path: Path, sizes: list[tuple[int, int]], is_black_ignored: bool =
 
 def mask_pole(is_valid: Mask, pole: str, half_angle_deg: float) -> Mask:
     """Return validity (H, W) without the rows whose centre is within `half_angle_deg` of the `pole`."""
+    if half_angle_deg <= 0.0:
+        return is_valid
     height = len(is_valid)
     from_zenith = (np.arange(height) + 0.5) * 180.0 / height
     from_pole = from_zenith if pole == "zenith" else from_zenith[::-1]

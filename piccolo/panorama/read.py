@@ -153,6 +153,8 @@ def _on_sphere(
     if of_one is None or len(cameras) > 1:
         return masked
     is_hidden = is_valid & ~masked.is_valid
+    if not is_hidden.any():
+        is_hidden = np.zeros(is_valid.shape, np.bool_)  # it mostly takes no memory
     focal = cameras[0].camera.focal[0]
     prior = FocalPrior(focal, of_one.deviation, of_one.source, views[0], is_hidden)
     return replace(masked, focal_prior=prior)
