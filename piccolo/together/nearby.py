@@ -10,6 +10,7 @@ import numpy as np
 
 from ..geometry.pose import Pose
 from ..judge.by_others import believe_nearby
+from ..judge.probability import LOCALIZED
 from ..judge.result import Result
 from ..localization.judging import judge
 from ..localization.localize import find, prepare_search
@@ -26,7 +27,7 @@ def localize_nearby(
 ) -> Result | None:
     """Return the result of a photo within reach of others, whose poses in the map are known.
 
-    None if there is no place, or the photo is surer by itself.
+    None if there is no place, or it is not sure there either.
     """
     whole = prepare_search(scan_map, shot.panorama, shot.settings, means.watch)
     if whole is None:
@@ -41,7 +42,7 @@ def localize_nearby(
         return None
     belief = believe_nearby(found.belief, alone.belief, len(whole.scan_map.sparse) / len(near.sparse))
     result = found.take_belief(belief, demand.min_confidence)
-    return result if result.confidence > alone.confidence else None
+    return result if result.status == LOCALIZED else None
 
 
 def narrow_around(scan_map: ScanMap, located: Sequence[Pose]) -> ScanMap:
