@@ -23,7 +23,7 @@ from research.synthetic.world import render_picture
 
 TIER = "scene"
 
-SIZE = (320, 240)
+SIZE = (480, 360)
 NEAR = (*(round(x, 1) for x in taken_photos()[0][1].center_world.tolist()), 1.0)  # [m] place and radius
 FOCAL = 0.5 * SIZE[0] / math.tan(math.radians(37.5))
 
