@@ -22,7 +22,7 @@ from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
 from .beside import recall_gaussian
 from .group import NUM_ANCHORS, Grouped, localize_linked
-from .links import FIRM, Placed, find_links, match_each, spread
+from .links import FIRM, WEAK, Placed, find_links, match_each, spread
 from .members import Member, Shot, check_photos, find_alone
 
 
@@ -120,7 +120,8 @@ def list_placed(members: Mapping[int, Member], unsure: set[int], workers: Worker
     def place(number: int, rank: int = 0) -> Placed:
         return links.place(number, members[number].own_poses[rank][0].pose)
 
-    placed = set(spread(links, {k: place(k) for k in members if k not in unsure}, members, FIRM)) & unsure
+    firmly = spread(links, {k: place(k) for k in members if k not in unsure}, members, FIRM)
+    placed = set(spread(links, firmly, members, WEAK)) & unsure
     for k in sorted(unsure - placed):
         for rank in range(min(len(members[k].own_poses), NUM_ANCHORS)):
             found = spread(links, {k: place(k, rank)}, unsure, FIRM)
