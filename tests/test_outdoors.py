@@ -7,6 +7,7 @@ import pytest
 
 from piccolo.camera.model import camera_of_fov
 from piccolo.jobs.threads import Workers
+from piccolo.panorama.cameras import OF_PIXELS
 from research.measuring import outdoor_trials as trials
 from research.synthetic import outdoor_scans as scans, world as worlds
 from research.synthetic.layout import PLAIN, RoomBuilder
@@ -124,6 +125,8 @@ def test_trials_have_photos_of_the_place_and_of_another(monkeypatch):
         cases = [f"{' by '.join(scan)}, {what}" for what in ("photo", "panorama", "elsewhere")]
         assert list(dict.fromkeys(trial.case for trial in own)) == cases
         assert all((trial.true_pose is None) == trial.case.endswith("elsewhere") for trial in own)
+    off = np.log([t.focal_px / photo.focal_px for t in made[0][1] if t.case.endswith(", photo")])
+    assert 0.1 * OF_PIXELS < np.abs(off).max() < 4.0 * OF_PIXELS
     counts = trials.NUM_PHOTOS + trials.NUM_PANORAMAS + trials.NUM_ELSEWHERE
     assert {len(own) for _, own in made} == {counts}
     assert len(list(itertools.chain(*(own for _, own in made)))) == counts * len(made)

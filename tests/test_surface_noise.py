@@ -5,7 +5,15 @@ import pytest
 import rooms
 
 from piccolo.cloud.octree import build_octree
-from piccolo.cloud.surfaces import NOISE_SHARE, UNKNOWN_DISPLACEMENT, displacement, surface_variance
+from piccolo.cloud.surfaces import (
+    FULL_SHARE,
+    NOISE_CELLS,
+    NOISE_SHARE,
+    UNKNOWN_DISPLACEMENT,
+    displacement,
+    share_in_full,
+    surface_variance,
+)
 
 SIZE = np.array([5.0, 4.0, 2.6])  # [m] of a room turned by 20 degrees, so that no wall is along an axis
 TURN = np.array([[0.9397, -0.342, 0.0], [0.342, 0.9397, 0.0], [0.0, 0.0, 1.0]])
@@ -75,3 +83,19 @@ def test_surfaces_of_a_wavy_scan_are_displaced():
 def test_a_scan_without_flat_cells_has_displacements_that_nobody_knows():
     points = np.random.default_rng(5).uniform(-1.0, 1.0, (50_000, 3))
     assert displacement(build_octree(rooms.voxels(points))) == UNKNOWN_DISPLACEMENT
+
+
+def thin(points, spacing):
+    """Keep one point of each cube of a side [m]."""
+    cubes = np.floor(points / spacing).astype(np.int64)
+    return points[np.unique(cubes, axis=0, return_index=True)[1]]
+
+
+@pytest.mark.parametrize("spacing", [0.05, 0.1])
+def test_a_thin_scan_has_no_more_noise_for_its_corners_and_furniture(spacing):
+    """Of small cells only those with several surfaces are full then; see `surface_variance`."""
+    points = rooms.room(2, 400_000)[1].points.astype(np.float64)
+    whole, thinned = (build_octree(rooms.voxels(some)) for some in (points, thin(points, spacing)))
+    assert share_in_full(whole, NOISE_CELLS[0]) > FULL_SHARE > share_in_full(thinned, NOISE_CELLS[0])
+    for octree in (whole, thinned):
+        assert np.sqrt(np.linalg.eigvalsh(surface_variance(octree)).max()) < 0.003

@@ -26,7 +26,12 @@ FULL_CREASE = 0.6  # root of the second eigenvalue; 0.7 for two planes at a righ
 BORDER = 0.08, 0.28  # distance of the surroundings' middle, divided by the radius: nothing, and a full border
 COS_UPRIGHT = 0.8, 0.95  # cosine of an edge's angle to the vertical: not vertical at all, and fully
 VERTICAL_BORDER = 0.9, 0.98
-CELLS = (3, 4)  # levels above the leaves: cells of 16 cm, or 32 cm where the scan is thin
+CELLS = (3, 4)  # levels above the leaves: cells of 16 and 32 cm, by which waves are found
+NOISE_CELLS = (3, 4, 5)  # noise by those of 16 cm, or of 32 or 64 cm where the scan is thin
+FULL_SHARE = (
+    0.4  # of the leaves, least in full cells: in a thinner scan those that are full have two surfaces
+)
+MOST_ACROSS = 0.05  # [m] deviation from a cell's plane: cells with more have several surfaces
 MIN_LEAVES = 20
 MIN_CELLS = 200
 MAX_CELLS = 20_000
@@ -37,9 +42,10 @@ ROUGHNESS = 0.005  # [m] of clean surfaces and the things on them
 LEAST_UNEVEN = 0.03  # least ratio of the two smaller variances of a cell that is not flat
 SURFACE = 1.28  # [m] chosen: size of surfaces, which are displaced against each other
 UNKNOWN_DISPLACEMENT = 0.01  # [m] chosen
-NUM_ITERATIONS = 20
-LEAST_RESIDUAL_SQUARED = 1e-5  # [m^2] of cells that fit, all alike
-NORM_RIDGE = 3e-3  # on the squared norm of the tensor: two walls at a right angle leave a part undetermined
+NUM_ITERATIONS = 60
+# [m^2] of cells that fit, all alike: below the noise of good scans, or cells with things pull its variance up
+LEAST_RESIDUAL_SQUARED = 1e-7
+NORM_RIDGE = 0.06  # on the norm of the tensor: two walls at a right angle leave a part undetermined
 
 
 class Surroundings(NamedTuple):
@@ -133,9 +139,12 @@ def surface_variance(octree: Octree) -> Array:
     """Return the covariance (3, 3) [m^2] of a position aligned with a scan, from the scan's own errors.
 
     It is zero for a scan with too few points. Each cell measures one direction, its normal: the tensor
-    is the one that fits most cells (least absolute deviations).
+    is the one that fits most cells (least absolute deviations). The cells are the smallest that most surfaces
+    fill: of smaller ones only those with several surfaces are full, which would be taken for noise.
     """
-    for levels_up in CELLS:
+    for levels_up in NOISE_CELLS:
+        if share_in_full(octree, levels_up) < FULL_SHARE:
+            continue
         cells = residual_moments(octree, levels_up)
         if len(cells[1]) >= MIN_CELLS:
             return fit_tensor(*cells)
@@ -162,15 +171,27 @@ class Planes(NamedTuple):
     axes: Array  # (C, 3, 3) in columns
 
 
+def find_edges_of_cells(octree: Octree, levels_up: int) -> Integers:
+    """Return where the leaves of each cell of a level begin, and their number (C + 1,)."""
+    level = len(octree.level_start) - 2 - levels_up
+    edges: Integers = np.arange(octree.level_start[level], octree.level_start[level + 1] + 1)
+    for _ in range(levels_up):
+        edges = octree.first_child[edges]
+    return edges
+
+
+def share_in_full(octree: Octree, levels_up: int) -> float:
+    """Return the share of the leaves that lie in the fuller cells of a level."""
+    counts = np.diff(find_edges_of_cells(octree, levels_up))
+    return float(counts[counts >= MIN_LEAVES].sum() / max(counts.sum(), 1))
+
+
 def fit_planes(octree: Octree, levels_up: int) -> Iterator[Planes]:
     """Yield planes through the leaves of the fuller cells of a level, of some cells at a time.
 
     Of more than MAX_CELLS, so many are taken.
     """
-    level = len(octree.level_start) - 2 - levels_up
-    edges = np.arange(octree.level_start[level], octree.level_start[level + 1] + 1)
-    for _ in range(levels_up):
-        edges = octree.first_child[edges]
+    edges = find_edges_of_cells(octree, levels_up)
     full = np.flatnonzero(np.diff(edges) >= MIN_LEAVES)
     full = full[np.linspace(0, len(full) - 1, min(len(full), MAX_CELLS)).astype(np.int64)]
     for begin in range(0, len(full), SOME_CELLS):
@@ -186,20 +207,22 @@ def fit_planes(octree: Octree, levels_up: int) -> Iterator[Planes]:
 
 
 def moments_of_cells(planes: Planes) -> tuple[Array, Array]:
-    """Return normals (C, 3) and variances (C,) of cells by the planes through their leaves.
+    """Return normals (C, 3) and variances (C,) of cells by the planes through their leaves, if they have one.
 
     The residuals of one noisy sheet have a kurtosis of 3, less what the cell cuts off; those of two sheets at
     +-b with noise of variance s^2 have E r^4 = 3 (b^2 + s^2)^2 - 2 b^4. The result is b^2 and a part of s^2.
     """
     offsets, counts, variances, axes = planes
     cell = np.repeat(np.arange(len(counts)), counts)
+    is_surface = (variances[:, 0] < MOST_ACROSS**2) & (variances[:, 1] > 0.5 * variances[:, 2])
     normals = axes[:, :, 0]
     across = np.maximum(variances[:, 0], ROUGHNESS**2)
     residuals = np.einsum("ij,ij->i", offsets, normals[cell])
     kurtosis = np.bincount(cell, residuals**4) / counts / across**2
     across -= ROUGHNESS**2
     of_sheets = np.sqrt(np.clip((ONE_SHEET - kurtosis) / (ONE_SHEET - 1.0), 0.0, 1.0)) * across
-    return normals, of_sheets + NOISE_SHARE**2 * (across - of_sheets)
+    found = of_sheets + NOISE_SHARE**2 * (across - of_sheets)
+    return normals[is_surface], found[is_surface]
 
 
 def displacement(octree: Octree) -> float:
@@ -226,12 +249,14 @@ def fit_tensor(normals: Array, variances: Array) -> Array:
     twice = np.where(rows == columns, 1.0, 2.0)
     design = normals[:, rows] * normals[:, columns] * twice
     weights = np.ones(len(variances))
+    ridge = 1.0  # weighted like a residual, so that it stays as small beside those of few cells
     tensor = np.zeros((3, 3))
     for _ in range(NUM_ITERATIONS):  # reweighted least squares
         weighted = design * weights[:, None]
-        normal_matrix = design.T @ weighted + NORM_RIDGE * weights.sum() * np.diag(twice)
+        normal_matrix = design.T @ weighted + NORM_RIDGE * len(variances) * ridge * np.diag(twice)
         found = np.linalg.solve(normal_matrix, weighted.T @ variances)
         weights = weigh_absolute(design @ found - variances, LEAST_RESIDUAL_SQUARED)
+        ridge = 1.0 / max(math.sqrt(twice @ found**2), LEAST_RESIDUAL_SQUARED)
     tensor[rows, columns] = tensor[columns, rows] = found
     values, axes = np.linalg.eigh(tensor)
     return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)

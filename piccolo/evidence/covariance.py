@@ -34,6 +34,7 @@ LEAST_BLOCKS = 13  # fewer do not tell six dimensions
 ONE_BLOCK = 1.001  # above 1, so that one block may hold all information
 UNCALIBRATED = 0.005  # deviation of the focal length's logarithm: a calibration is better known
 LEAST_STEP_RANGE = 0.005 / math.radians(0.1)  # [m] for moves of differences: shorter ones are lost in noise
+LEAST_ACTING = 0.25  # [m] distance of points that count: nearer ones are noise, as cameras stand clear
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
 TINY_VARIANCE = 1e-12  # [rad^2, m^2] least variance of errors of one photo alone
 COVARIANCE_SCALE = LAST.limits.loss_scale * LEVELS_PER_UNIT
@@ -85,6 +86,16 @@ def remove_hidden(points: Cells, is_valid: Mask, pose: Pose) -> Cells:
 def compute_median_range(points: Cells) -> float:
     """Return the median distance [m] of points from the centre around which they are."""
     return float(np.median(np.linalg.norm(points.offsets, axis=0)))
+
+
+def compute_acting_range(points: Cells) -> float:
+    """Return the distance [m] at which a move displaces what is seen as much as it does points in the mean.
+
+    It is that of the mean square of inverse distances from the centre around which the points are: near ones
+    tell moves from turns, and are displaced most by errors of surfaces.
+    """
+    squares = np.square(points.offsets).sum(axis=0, dtype=np.float64)
+    return float(np.mean(1.0 / np.maximum(squares, LEAST_ACTING**2)) ** -0.5)
 
 
 def compute_hessian(problem: ChannelProblem, pose: Pose, turn: float, median_range: float) -> Array:
@@ -286,9 +297,9 @@ def compute_covariance(photo: PhotoImages, points: Cells, pose: Pose, profile: P
 
 def split_errors(problem: Problem, pose: Pose, covariance: Array) -> PoseGaussian:
     """Return a pose in the map with its covariance (6, 6), of which the errors of the scan are in common."""
-    median_range = compute_median_range(problem.view_at(pose, "points"))
-    common = scan_covariance(problem.scan_map, median_range)
-    common += layer_covariance(problem.scan_map, pose, median_range)
+    acting_range = compute_acting_range(problem.view_at(pose, "points"))
+    common = scan_covariance(problem.scan_map, acting_range)
+    common += layer_covariance(problem.scan_map, pose, acting_range)
     variances, axes = np.linalg.eigh(covariance - common)
     return PoseGaussian(pose, (axes * np.maximum(variances, TINY_VARIANCE)) @ axes.T, common)
 
@@ -307,12 +318,12 @@ def estimate_errors(problem: Problem, candidate: Candidate, workers: Workers) ->
     by_matches = place_by_matches(problem.method, pose, drawn.matches)
     if by_matches is None:
         return errors
-    median_range = compute_median_range(problem.view_at(pose, "points"))
-    of_layers = layer_covariance(problem.scan_map, pose, median_range)
+    acting_range = compute_acting_range(problem.view_at(pose, "points"))
+    of_layers = layer_covariance(problem.scan_map, pose, acting_range)
     if errors.gaussian is not None:
         found = errors.gaussian.fuse(PoseGaussian(*by_matches, errors.gaussian.common))
     elif (candidate.num_matches or 0) >= problem.method.sure_matches:
-        found = PoseGaussian(*by_matches, scan_covariance(problem.scan_map, median_range) + of_layers)
+        found = PoseGaussian(*by_matches, scan_covariance(problem.scan_map, acting_range) + of_layers)
     else:
         return errors
     if contradictions(problem.scan_map, found.pose, problem.prior):
@@ -346,19 +357,19 @@ def estimate_covariance(
     if covariance is None:
         return UNKNOWN_ERRORS
     turned = pose.R_cam_from_world.T  # R_map_from_cam
-    median_range = compute_median_range(points)
+    acting_range = compute_acting_range(points)
     prior = problem.given.focal_prior
     is_calibrated = prior is None or prior.deviation < UNCALIBRATED
     method = problem.method
     turn = (method.pixel_share if is_calibrated else method.uncalibrated_share) * problem.pixel
-    of_grid = np.diag(np.repeat([turn**2, (turn * median_range) ** 2], 3))  # and of stitching, in all blocks
+    of_grid = np.diag(np.repeat([turn**2, (turn * acting_range) ** 2], 3))  # and of stitching, in all blocks
     own = turn_positions(covariance, turned) + of_grid
-    common = scan_covariance(problem.scan_map, median_range)
+    common = scan_covariance(problem.scan_map, acting_range)
     common = common + (1.0 - profile.own_share) * own
     own = profile.own_share * own
     std_of_fit = largest_std(own + common)
     if profile.compares_halves:
         added = disagreement(photo, points, pose, covariance, method.halves_score, workers)
         own = own + turn_positions(added, turned)
-    common = common + layer_covariance(problem.scan_map, pose, median_range)
+    common = common + layer_covariance(problem.scan_map, pose, acting_range)
     return Errors(PoseGaussian(pose, own, common), std_of_fit)

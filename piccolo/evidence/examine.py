@@ -9,6 +9,7 @@ from ..geometry.pose import Pose
 from ..jobs.threads import Workers
 from ..judge.candidate import NO_CANDIDATE, Candidate, Selection
 from ..judge.selection import list_drawn, select
+from ..local_features.hypotheses import count_matches
 from ..problem.problem import Problem
 from ..problem.profile import DRAWN_VIEW
 from .comparison import compare
@@ -41,10 +42,17 @@ def examine_each(problem: Problem, poses: Sequence[Pose], workers: Workers) -> l
 
 
 def count_agreeing(problem: Problem, candidate: Candidate, workers: Workers) -> Candidate:
-    """Count the photo's features that agree with the scan drawn at a candidate."""
+    """Count the photo's features that agree with the scan drawn at a candidate.
+
+    They are those of the best pose near it. If that is farther away, as it may be where surfaces are far,
+    they are those that agree with the candidate itself, if there are more than by chance.
+    """
     drawn = draw_near(problem, candidate.pose, candidate.drawn, workers)
     found = verify(problem, candidate.pose, drawn.matches)
-    count = found.num_matches if CONFIRMED.holds(found.pose, candidate.pose) else 0
+    count = found.num_matches
+    if not CONFIRMED.holds(found.pose, candidate.pose):
+        agreeing = count_matches(drawn.matches, candidate.pose, problem.method.cos_agree)
+        count = agreeing if agreeing > problem.method.chance_matches else 0
     return replace(candidate, num_matches=count, drawn=drawn)
 
 

@@ -35,7 +35,7 @@ from ..problem.problem import Problem
 from ..problem.stages import Limits
 from ..views.view import Cells
 from .comparison import mask_occluders
-from .covariance import UNCALIBRATED, compute_median_range
+from .covariance import UNCALIBRATED, compute_acting_range
 from .lens_matches import MOST_LENS_CHANGE, MatchFit, add_matches, fit_matches
 from .scan_errors import displacement_variance
 from .self_calibration import (
@@ -318,8 +318,8 @@ def estimate_lens(problem: Problem, pose: Pose, end: FreeEnd, by_matches: MatchF
     estimate = add_errors(estimate, (problem.method.edge_error * per_px) ** 2 * np.eye(len(LENS)))
     if by_matches is not None:
         estimate = add_matches(estimate, by_matches)
-    median_range = compute_median_range(problem.view_at(pose, "points"))
-    variance = displacement_variance(problem.scan_map, pose, median_range)
+    acting_range = compute_acting_range(problem.view_at(pose, "points"))
+    variance = displacement_variance(problem.scan_map, pose, acting_range)
     return add_errors(estimate, displace_blocks(end, variance))
 
 

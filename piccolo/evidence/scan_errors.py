@@ -11,7 +11,7 @@ SHAPE_TURN = 0.003  # [rad] by which edges of a photo are not where the scan's a
 SHAPE_MOVE = 0.01  # [m]
 
 
-def scan_covariance(scan_map: ScanMap, median_range: float) -> Array:
+def scan_covariance(scan_map: ScanMap, acting_range: float) -> Array:
     """Return the covariance (6, 6) [rad, m], in the map's axes, of errors of the scan.
 
     These are correlated over many blocks: its noise and doubled surfaces (`surface_variance`); of shape alone
@@ -19,25 +19,25 @@ def scan_covariance(scan_map: ScanMap, median_range: float) -> Array:
     """
     surface = scan_map.surface_variance
     covariance = np.zeros((6, 6))
-    covariance[:3, :3] = np.eye(3) * np.trace(surface) / 3.0 / median_range**2
+    covariance[:3, :3] = np.eye(3) * np.trace(surface) / 3.0 / acting_range**2
     covariance[3:, 3:] = surface
     if scan_map.has_shape:
         covariance += np.diag(np.repeat([SHAPE_TURN**2, SHAPE_MOVE**2], 3))
     return covariance
 
 
-def layer_covariance(scan_map: ScanMap, pose: Pose, median_range: float) -> Array:
+def layer_covariance(scan_map: ScanMap, pose: Pose, acting_range: float) -> Array:
     """Return the covariance (6, 6) [rad, m] of a pose in the map by two layers of the scan's surfaces.
 
     It is apart from `scan_covariance`, as it is no evidence that a photo was taken elsewhere.
     """
     if not scan_map.layers.any():
         return np.zeros((6, 6))
-    variance = gap_variance(scan_map.layers, pose.center_world, median_range)
-    return np.diag(np.repeat([variance / median_range**2, variance], 3))
+    variance = gap_variance(scan_map.layers, pose.center_world, acting_range)
+    return np.diag(np.repeat([variance / acting_range**2, variance], 3))
 
 
-def displacement_variance(scan_map: ScanMap, pose: Pose, median_range: float) -> Array:
+def displacement_variance(scan_map: ScanMap, pose: Pose, acting_range: float) -> Array:
     """Return the covariance (3, 3) [m^2], in the map's axes, by which surfaces lie beside where they are."""
-    common = scan_covariance(scan_map, median_range) + layer_covariance(scan_map, pose, median_range)
+    common = scan_covariance(scan_map, acting_range) + layer_covariance(scan_map, pose, acting_range)
     return common[3:, 3:] + scan_map.displacement**2 * np.eye(3)
