@@ -16,6 +16,7 @@ from research.synthetic.outdoors import PLACE_KINDS, SKY, SUN, make_place
 from research.synthetic.raycast import cast_rays
 
 WORKERS = Workers(2)
+pytestmark = pytest.mark.research
 SIZE = (256, 192)  # [px] of photos
 
 

@@ -343,10 +343,10 @@ def test_a_narrow_photo_of_unknown_gravity_is_found(seed, yaw, most, most_deg):
 @pytest.mark.parametrize(("by_chance", "is_counted"), [(6, True), (10_000, False)])
 def test_matches_with_a_pose_count_though_the_best_pose_is_farther_away(by_chance, is_counted, monkeypatch):
     """It may be where surfaces are far; then those that agree with the pose itself, if not by chance."""
-    pose = _true_pose()
+    pose = narrow_photo.true_pose()
     away = Pose(pose.R_cam_from_world, pose.center_world + np.array([0.4, 0.0, 0.0]))
     monkeypatch.setattr("piccolo.evidence.examine.verify", lambda *_: verification.Verified(away, 50))
-    profile = replace(_problem().profile, method=replace(METHOD, chance_matches=by_chance))
+    profile = replace(narrow_photo.problem().profile, method=replace(METHOD, chance_matches=by_chance))
     at_pose = count_matches(_draw(pose), pose, METHOD.cos_agree)
     assert METHOD.sure_matches < at_pose != 50
-    assert _count(replace(_problem(), profile=profile), pose) == (at_pose if is_counted else 0)
+    assert _count(replace(narrow_photo.problem(), profile=profile), pose) == (at_pose if is_counted else 0)
