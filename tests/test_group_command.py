@@ -120,10 +120,10 @@ def test_a_batch_looks_at_photos_that_are_not_sure_together(folder, tmp_path, ca
     lines = [untimed_line(line) for line in out.read_text().splitlines()]
     assert [line["status"] for line in lines] == ["localized"] * 3
     assert lines[2]["beside"] is None, "it is localized alone"
-    for k in (0, 1):
-        others = [name.rpartition("/")[2] for name in lines[k]["beside"]["photos"]]
-        assert sorted(others) == [f"{n}.png" for n in range(3) if n != k]
-        assert lines[k]["beside"]["is_together"]
+    beside = [[name.rpartition("/")[2] for name in line["beside"]["photos"]] for line in lines[:2]]
+    assert sorted(beside[0]) == ["1.png", "2.png"], "together"
+    assert beside[1] == ["2.png"], "beside the one that is sure"
+    assert [line["beside"]["is_together"] for line in lines[:2]] == [True, False]
     capsys.readouterr()
     before = out.read_bytes()
     main([*words, "--out", str(out)])
@@ -131,10 +131,12 @@ def test_a_batch_looks_at_photos_that_are_not_sure_together(folder, tmp_path, ca
     assert out.read_bytes() == before
     scan = open_scan(rooms.map_path(SEED))
     photos = [Photo(str(name), focal_px=FOCAL) for name in names]
-    assert [untimed_line(r.to_json()) for r in scan.localize_many(photos, gravity="known")] == lines
+    found = scan.localize_many(photos, gravity="known", prior=Prior(near=NEAR[:3], radius=NEAR[3]))
+    assert [untimed_line(result.to_json()) for result in found] == lines
     pictures = {name.name: name.read_bytes() for name in names}
     with serving("--cloud", rooms.map_path(SEED), "--jobs", "1") as client:
-        asked = {"photo": {"focal_px": FOCAL}, "gravity": "known"}
+        near = {"near": NEAR[:3], "radius": NEAR[3]}
+        asked = {"photo": {"focal_px": FOCAL}, "prior": near, "gravity": "known"}
         _, _, body = client.post_all("/localize", pictures, asked)
     for answer, line in zip(map(untimed_line, body.decode().splitlines()), lines, strict=True):
         assert answer | {"pano": line["pano"], "beside": line["beside"]} == line

@@ -16,13 +16,14 @@ import numpy as np
 
 from ..arrays import Array, Array32
 from ..geometry.sphere import HALF_PI, PI, atan2
-from ..kernels.jit import F0, F1, kernel
+from ..kernels.jit import F0, F1, Scalar, kernel
 from .calibration import Mount
 from .model import PARTIAL_SPHERE, Camera
 
 LENS = ("log_focal", "log_aspect", "center_x", "center_y", "radial")
 FOCAL = LENS.index("log_focal")
 OF_SPHERE = ("log_width", "log_height", "horizon")
+PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")  # of which a place in the plane is a ray
 STEP_PX = 0.01  # with which rays are differentiated by pixels
 
 
@@ -52,14 +53,24 @@ class Corrections:
 
     def displace(self, points_cam: Array32, values: Array) -> Displaced:
         """Return where points (3, N) are seen if the picture has corrections (p,) that nobody knew of."""
-        if not self.is_of_sphere:
+        camera = self.mount.camera
+        if not self.is_of_sphere and camera.model not in PINHOLES:
             return self._displace_in_lens(points_cam, values)
         num = points_cam.shape[1]
-        found = Displaced(
-            np.empty((3, num), np.float32), np.empty((3, 3, num), np.float32), np.empty(num, np.float32)
-        )
-        displace_on_sphere(points_cam, np.asarray(values, np.float32), *found)
+        moves = np.empty((len(self.names), 3, num), np.float32)
+        found = Displaced(np.empty((3, num), np.float32), moves, np.empty(num, np.float32))
+        given = np.asarray(values, np.float32)
+        if self.is_of_sphere:
+            displace_on_sphere(points_cam, given, *found)
+        else:
+            R_lens_from_cam = np.asarray(self.mount.rotation, np.float32)
+            displace_in_pinhole(points_cam, R_lens_from_cam, np.float32(self.least_ahead), given, *found)
         return found
+
+    @property
+    def least_ahead(self) -> float:
+        """Cosine of the angle from the lens's axis beyond which nothing is shown."""
+        return math.cos(min(self.mount.camera.max_angle, 0.5 * math.pi))
 
     def _displace_in_lens(self, points_cam: Array32, values: Array) -> Displaced:
         camera = self.mount.camera
@@ -67,7 +78,7 @@ class Corrections:
         ranges = np.linalg.norm(points_cam, axis=0).astype(np.float64)
         rays = (points_cam / ranges).T @ R_cam_from_lens
         pixels, is_in = camera.pixels(rays)
-        is_ahead = is_in | (rays[:, 0] > math.cos(min(camera.max_angle, 0.5 * math.pi)))
+        is_ahead = is_in | (rays[:, 0] > self.least_ahead)
         center = np.array(camera.center)
         focal = np.array(camera.focal)
         plane, by_values = correct_plane((pixels - center) / focal, values)
@@ -147,3 +158,64 @@ def displace_on_sphere(
         moves[2, 1, n] = r * sin_up * sin_left
         moves[2, 2, n] = -r * cos_up
         is_shown[n] = F1 if abs(left) <= PI and abs(up) <= HALF_PI else F0
+
+
+@kernel
+def displace_in_pinhole(
+    points: Array32,
+    R_lens_from_cam: Array32,
+    least_ahead: Scalar,
+    values: Array32,
+    displaced: Array32,
+    moves: Array32,
+    is_shown: Array32,
+) -> None:
+    """Write where points (3, N) are seen by a pinhole with corrections (5,), and derivatives (5, 3, N).
+
+    A ray is u = q / |q|, q = (1, -x, -y), and moves by (I - u u^T) dq / |q|. What is not ahead stays.
+    """
+    R = R_lens_from_cam
+    wide = np.float32(math.exp(values[0]))
+    high = np.float32(math.exp(values[0] + values[1]))
+    turned = np.empty(3, np.float32)
+    step = np.empty((5, 2), np.float32)
+    for n in range(points.shape[1]):
+        square = F0
+        for i in range(3):
+            turned[i] = R[i, 0] * points[0, n] + R[i, 1] * points[1, n] + R[i, 2] * points[2, n]
+            square += turned[i] * turned[i]
+        r = np.float32(math.sqrt(square))
+        is_ahead = turned[0] > least_ahead * r
+        is_shown[n] = F1 if is_ahead else F0
+        if not is_ahead:
+            displaced[:, n] = points[:, n]
+            moves[:, :, n] = F0
+            continue
+        x = -turned[1] / turned[0]
+        y = -turned[2] / turned[0]
+        r2 = x * x + y * y
+        scale = F1 + values[4] * r2
+        step[0, 0] = x * wide * scale
+        step[0, 1] = y * high * scale
+        step[1, 0] = F0
+        step[1, 1] = step[0, 1]
+        step[2, 0] = F1
+        step[2, 1] = F0
+        step[3, 0] = F0
+        step[3, 1] = F1
+        step[4, 0] = x * wide * r2
+        step[4, 1] = y * high * r2
+        x_new = step[0, 0] + values[2]
+        y_new = step[0, 1] + values[3]
+        ahead = F1 / np.float32(math.sqrt(F1 + x_new * x_new + y_new * y_new))
+        left = -x_new * ahead
+        up = -y_new * ahead
+        for i in range(3):
+            displaced[i, n] = r * (R[0, i] * ahead + R[1, i] * left + R[2, i] * up)
+        for k in range(5):
+            along = -left * step[k, 0] - up * step[k, 1]
+            of_x = -along * ahead
+            of_y = -step[k, 0] - along * left
+            of_z = -step[k, 1] - along * up
+            for i in range(3):
+                moves[k, i, n] = r * ahead * (R[0, i] * of_x + R[1, i] * of_y + R[2, i] * of_z)
