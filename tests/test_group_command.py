@@ -109,6 +109,7 @@ def test_photos_of_a_folder_are_localized_together_and_named(folder, tmp_path, c
         }
 
 
+@pytest.mark.process
 def test_a_batch_looks_at_photos_that_are_not_sure_together(folder, tmp_path, capsys):
     """One of three is localized alone; all doors say the same, and a second run has nothing to do."""
     out = tmp_path / "poses.jsonl"
