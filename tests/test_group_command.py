@@ -14,9 +14,7 @@ from services import serving
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli.localize import main
-from piccolo.opening import open_scan
 from piccolo.panorama.video import choose_distinct
-from piccolo.photo import Photo, Prior
 from piccolo.result_files import read_results
 from research.synthetic.walk_frames import writing_video
 from research.synthetic.world import render_picture
@@ -86,12 +84,6 @@ def test_photos_of_a_folder_are_localized_together_and_named(folder, tmp_path, c
     assert {step["pano"].rpartition("/")[2] for step in steps} == {"0.png", "1.png", "2.png", "mirrored.png"}
 
     lines = [untimed_line(result.to_json()) for result in by_name.values()]
-    photos = [Photo(result.pano, focal_px=FOCAL) for result in by_name.values()]
-    scan = open_scan(rooms.map_path(SEED))
-    assert [
-        untimed_line(r.to_json())
-        for r in scan.localize_together(photos, gravity="known", prior=Prior(near=NEAR[:3], radius=NEAR[3]))
-    ] == lines
     pictures = {name: (folder / name).read_bytes() for name in by_name}
     near = {"near": NEAR[:3], "radius": NEAR[3]}
     asked = {"photo": {"focal_px": FOCAL}, "prior": near, "gravity": "known", "together": True}
@@ -111,7 +103,7 @@ def test_photos_of_a_folder_are_localized_together_and_named(folder, tmp_path, c
 
 @pytest.mark.process
 def test_a_batch_looks_at_photos_that_are_not_sure_together(folder, tmp_path, capsys):
-    """One of three is localized alone; all doors say the same, and a second run has nothing to do."""
+    """One of three is localized alone; the service says the same, and a second run has nothing to do."""
     out = tmp_path / "poses.jsonl"
     names = [folder / f"{name}.png" for name in range(3)]
     words = _command(folder)
@@ -130,10 +122,6 @@ def test_a_batch_looks_at_photos_that_are_not_sure_together(folder, tmp_path, ca
     main([*words, "--out", str(out)])
     assert "nothing is left to do" in capsys.readouterr().err
     assert out.read_bytes() == before
-    scan = open_scan(rooms.map_path(SEED))
-    photos = [Photo(str(name), focal_px=FOCAL) for name in names]
-    found = scan.localize_many(photos, gravity="known", prior=Prior(near=NEAR[:3], radius=NEAR[3]))
-    assert [untimed_line(result.to_json()) for result in found] == lines
     pictures = {name.name: name.read_bytes() for name in names}
     with serving("--cloud", rooms.map_path(SEED), "--jobs", "1") as client:
         near = {"near": NEAR[:3], "radius": NEAR[3]}
