@@ -18,7 +18,7 @@ from ..arrays import Array
 from ..evidence.examine import complete, examine
 from ..evidence.focal_length import FocalFit
 from ..geometry.pose import Pose
-from ..geometry.pose_gaussian import LIKELY, PoseGaussian, subtract
+from ..geometry.pose_gaussian import PoseGaussian, subtract
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.by_others import LOCAL_ERRORS, Shares, believe_together
 from ..judge.candidate import Selection
@@ -55,7 +55,6 @@ from .members import Member, Shot, find_members
 
 EVEN_ODDS = 0.5
 NUM_EXCHANGED = 8  # chosen: photos whose relative pose another may have by mistake
-MOST_STD_OF_OTHERS = 0.1  # chosen: [m] of a pose by which other photos are placed or confirmed
 MOST_GAIN = 3.0  # [log] by being where it was to be expected
 TOLD = 2.0  # deviations of the scale, and ratio of other errors to those expected, that are reported
 NOT_FOUND = "`relative_poses`: no pose of all photos together was found"
@@ -314,29 +313,7 @@ def judge_placed(
         alone = replace(member.alone.belief, within=min(within, member.alone.belief.within))
     belief = believe_together(shares, probabilities, within, within_others, alone)
     found = recalibrate_at(member, support, gaussian.pose, elsewhere, means.workers)
-    if is_agreed and is_confirmed(support.gaussian, expected):
-        found = trust_camera(found)
     return judge_together(found, gaussian, belief, means, demand.min_confidence)
-
-
-def is_confirmed(own: PoseGaussian | None, expected: PoseGaussian | None) -> bool:
-    """Return True if the others expect a photo where its own picture puts it, and know that well."""
-    if own is None or expected is None or expected.largest_std > MOST_STD_OF_OTHERS:
-        return False
-    return own.square_distance(expected) <= LIKELY
-
-
-def trust_camera(found: Found) -> Found:
-    """Return a photo's poses without the conflict of its focal length with that of its camera's other photos.
-
-    At a wrong place the two differ. Where others confirm the place, it is one picture's word against those of
-    several: that of a bare wall may be far off.
-    """
-    prior = found.problem.given.focal_prior
-    fit = found.fit
-    if prior is None or not prior.is_measured or not isinstance(fit, FocalFit):
-        return found
-    return found._replace(fit=fit._replace(conflict=0.0, doubt=0.0))
 
 
 def weigh_local(share: float, expected: PoseGaussian | None, own: PoseGaussian) -> float:

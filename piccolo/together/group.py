@@ -23,7 +23,7 @@ from ..local_features.hypotheses import count_matches
 from ..localization.means import Means
 from ..problem.accuracy import Demand
 from ..scan_map.scan_map import ScanMap
-from .bundle import EVEN_ODDS, MOST_STD_OF_OTHERS, judge_placed, place_between, weigh_local
+from .bundle import EVEN_ODDS, judge_placed, place_between, weigh_local
 from .bundle_search import NUM_BUNDLES, Support, find_support, weigh_bundles
 from .links import FIRM, WEAK, Links, Places, are_bridged, compute_shared, find_links, find_pose, spread
 from .members import Member, Shot, find_members
@@ -34,6 +34,7 @@ LEAST_LIKELY = 1e-3  # chosen: probability of such a pose
 MOST_SPREAD = 12  # places of the group that are looked at
 BELONGS_WEAKLY = 0.7  # chosen: probability that a photo belongs where few matches put it
 MOST_SOURCES = 3  # photos by whose errors a photo is placed
+MOST_STD_OF_SOURCE = 0.1  # chosen: [m] deviation of the own pose of one by which others are placed
 LEAST_LOCATED = 2  # photos that tell where the others were taken
 NUM_LOCATED = 2  # rounds in which local optima are told from right poses
 UNCERTAIN = np.zeros((6, 6))
@@ -268,7 +269,7 @@ def expect_all(links: Links, places: Places, own: Mapping[int, PoseGaussian]) ->
 
     A photo whose own pose is uncertain, as of a bare wall, is where it is expected.
     """
-    known = {number: one for number, one in own.items() if one.largest_std < MOST_STD_OF_OTHERS}
+    known = {number: one for number, one in own.items() if one.largest_std < MOST_STD_OF_SOURCE}
     located = {number: links.place(number, one.pose) for number, one in known.items()}
     expected: dict[int, PoseGaussian] = {}
     for number in [*known, *(k for k in places if k not in known)]:
