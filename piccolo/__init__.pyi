@@ -21,6 +21,7 @@ from .problem.settings import CoarseToFineSettings as CoarseToFineSettings
 from .report.build import ReportSettings as ReportSettings, write_report as write_report
 from .scan import Scan as Scan
 from .scan_walk import Walk as Walk
+from .together.bundle_adjustment import RelativePoses as RelativePoses
 from .together.walk.frames import Motion as Motion
 
 __version__: str

@@ -33,7 +33,7 @@ from .scan_map.scan_map import ScanMap, check_within
 from .scan_photo import Asked, localize_photo
 from .scan_walk import Walk
 from .second_look import Looking, Others
-from .together.bundle_adjustment import RelativeScale
+from .together.bundle_adjustment import RelativePoses
 from .together.second_looks import Look, localize_in_order
 from .together.walk.frames import Motion
 from .together.walk.tracker import Tracker
@@ -209,9 +209,8 @@ class Scan:
     def localize_bundle(
         self,
         photos: Iterable[Picture],
-        relative_poses: Sequence[Pose],
+        relative_poses: Sequence[Pose] | RelativePoses,
         *,
-        relative_scale: RelativeScale = "metres",
         prior: Prior | None = None,
         gravity: Gravity | None = None,
         accuracy: Accuracy | None = None,
@@ -219,24 +218,24 @@ class Scan:
     ) -> list[Result]:
         """Localize photos together whose poses relative to each other are known.
 
-        `relative_poses` has one of each photo, in any common frame [m], such as that of a phone's tracker.
-        The scale of their positions is fitted: within 1 % of metres, or freely if `relative_scale` is
-        "unknown", as of COLMAP. Raises InputError for a photo that can't be read.
+        `relative_poses` has one of each photo, in any common frame [m]; RelativePoses are of another scale.
+        Raises InputError for a photo that can't be read.
         """
         check_kind("photos", photos, Iterable[Picture])
-        check_kind("relative_poses", relative_poses, Sequence[Pose])
-        check_kind("relative_scale", relative_scale, RelativeScale)
+        relative = relative_poses
+        if not isinstance(relative, RelativePoses):
+            relative = RelativePoses(relative)
         given = [as_photo(photo) for photo in photos]
-        check_one_each("relative_poses", relative_poses, len(given), "photo")
+        check_one_each("relative_poses", relative.poses, len(given), "photo")
         settings = self._change(prior, gravity, accuracy, min_confidence)
         scan_map, settings = self.require_default_method("`relative_poses`", settings)
         for photo in given:
             self.check_options(photo, settings)
         asked = [
             AskedPosed(photo, check_pose(pose, "`relative_poses`"), settings)
-            for photo, pose in zip(given, relative_poses, strict=True)
+            for photo, pose in zip(given, relative.poses, strict=True)
         ]
-        return localize_posed(scan_map, self.reader, self.workers, asked, relative_scale)
+        return localize_posed(scan_map, self.reader, self.workers, asked, relative.scale)
 
     def color(
         self,
@@ -319,7 +318,6 @@ class Scan:
         motion: Motion | None = None,
         prior: Prior | None = None,
         gravity: Gravity | None = None,
-        accuracy: Accuracy | None = None,
     ) -> list[Result]:
         """Localize the frames of a walk together: each frame restricts the poses of the others.
 
@@ -331,7 +329,7 @@ class Scan:
             Time of each frame [s], increasing. Without times only the order counts.
         odometry
             Pose of the camera at each frame in any common frame [m], or None.
-        motion, prior, gravity, accuracy
+        motion, prior, gravity
             As in `track`.
 
         `walk` of a result says how its pose was found. Raises InputError if times and frames differ in
@@ -345,7 +343,7 @@ class Scan:
         >>> [result.status for result in scan.localize_walk(frames, times=[0.0, 5.0])]
         ['localized', 'localized']
         """
-        walk = self.track(motion=motion, prior=prior, gravity=gravity, accuracy=accuracy)
+        walk = self.track(motion=motion, prior=prior, gravity=gravity)
         check_kind("frames", frames, Iterable[Picture])
         check_kind("times", times, Sequence[float] | Floats | None)
         check_kind("odometry", odometry, Sequence[Pose | None] | None)

@@ -30,6 +30,7 @@ from piccolo.together.bundle import (
     compare_errors,
     judge_member,
     localize_bundle,
+    merge_places,
 )
 from piccolo.together.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
 
@@ -339,3 +340,13 @@ def test_a_photo_that_shows_nothing_is_not_localized():
     found = _together([nothing, *photos[1:]], _relative(poses))
     assert [f.status for f in found] == ["not_localized", "localized", "localized"]
     assert found[0].pose is None
+
+
+def test_places_that_are_one_for_a_photo_are_one_alternative():
+    """Of bundles whose other photos differ."""
+    near, far = [Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.05, 3.0)]
+    places, probabilities = merge_places(
+        Pose(np.eye(3), np.zeros(3)), [far, near, far], np.array([4, 3, 2, 1, 6])
+    )
+    assert places == [far]
+    assert probabilities.tolist() == [6.0, 4.0, 6.0]

@@ -148,6 +148,14 @@ def test_scan_localizes_many_together(scene):
     assert scan_of_room(7).localize_bundle([], []) == []
 
 
+def test_positions_of_unknown_scale_are_scaled(scene):
+    photos, poses = _photos_and_poses(scene)
+    doubled = [Pose(pose.R_cam_from_world, 2.0 * pose.center_world) for pose in poses]
+    of_any_scale = piccolo.RelativePoses(doubled, "unknown")
+    _assert_right(scene, scan_of_room(7).localize_bundle(photos, of_any_scale, gravity="known"))
+    assert_input_error("`scale`: found 'feet'", piccolo.RelativePoses, doubled, "feet")
+
+
 def test_relative_poses_that_are_none_are_refused(scene, tmp_path):
     photos, poses = _photos_and_poses(scene)
     scan = scan_of_room(7)

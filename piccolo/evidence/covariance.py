@@ -362,7 +362,8 @@ def estimate_covariance(
     is_calibrated = prior is None or prior.deviation < UNCALIBRATED
     method = problem.method
     turn = (method.pixel_share if is_calibrated else method.uncalibrated_share) * problem.pixel
-    of_grid = np.diag(np.repeat([turn**2, (turn * acting_range) ** 2], 3))  # and of stitching, in all blocks
+    move = turn * compute_median_range(points)
+    of_grid = np.diag(np.repeat([turn**2, move**2], 3))  # and of stitching, in all blocks
     own = turn_positions(covariance, turned) + of_grid
     common = scan_covariance(problem.scan_map, acting_range)
     common = common + (1.0 - profile.own_share) * own

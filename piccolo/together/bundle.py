@@ -17,6 +17,7 @@ import numpy as np
 from ..arrays import Array
 from ..evidence.examine import complete, examine
 from ..evidence.focal_length import FocalFit
+from ..geometry.nearness import RIGHT
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, subtract
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
@@ -311,9 +312,28 @@ def judge_placed(
     alone = None
     if member.alone.status == LOCALIZED and is_agreed and member.alone.gaussian:
         alone = replace(member.alone.belief, within=min(within, member.alone.belief.within))
+    elsewhere, probabilities = merge_places(gaussian.pose, elsewhere, probabilities)
     belief = believe_together(shares, probabilities, within, within_others, alone)
     found = recalibrate_at(member, support, gaussian.pose, elsewhere, means.workers)
     return judge_together(found, gaussian, belief, means, demand.min_confidence)
+
+
+def merge_places(pose: Pose, elsewhere: Sequence[Pose], probabilities: Array) -> tuple[list[Pose], Array]:
+    """Merge poses that are one for a photo, though others of its bundle differ; add up their probabilities.
+
+    `probabilities` (K + 1,) are of the pose, of those elsewhere, and of none. Returns those that are left
+    elsewhere, and the probabilities.
+    """
+    places = [pose]
+    sums = [float(probabilities[0])]
+    for other, probability in zip(elsewhere, probabilities[1:-1].tolist(), strict=True):
+        same = next((k for k, place in enumerate(places) if RIGHT.holds(place, other)), None)
+        if same is None:
+            places.append(other)
+            sums.append(probability)
+        else:
+            sums[same] += probability
+    return places[1:], np.array([*sums, probabilities[-1]])
 
 
 def weigh_local(share: float, expected: PoseGaussian | None, own: PoseGaussian) -> float:

@@ -6,11 +6,13 @@ tell how large these are, whether the positions are too long, and which photo do
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
+from ..arguments import check_kind
 from ..arrays import Array
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LIKELY, LOOSE, PoseGaussian, add, differentiate, mean_of, subtract
@@ -25,6 +27,32 @@ NUM_ADJUSTMENT_ROUNDS = 4  # in which errors of relative poses and the bundle ar
 TELLING_RATIO = 10.0  # ratio of variances (F) by which one photo differs from the others: it contradicts them
 MEDIAN = 2.366  # of chi square of 3
 QUANTILE = 1.645  # deviations of the normal distribution below which 95 % lie
+
+
+@dataclass(frozen=True)
+class RelativePoses:
+    """Poses of photos relative to each other.
+
+    Parameters
+    ----------
+    poses
+        One of each photo, in any common frame, such as that of a phone's tracker.
+    scale
+        "metres" if positions are good to 1 %, "unknown" if they may have any scale, as of COLMAP.
+
+    Raises
+    ------
+    InputError
+        A value is of another kind.
+    """
+
+    poses: Sequence[Pose]
+    scale: RelativeScale = "metres"
+
+    def __post_init__(self) -> None:
+        """Refuse values of other kinds, by the name that a user gave them."""
+        check_kind("relative_poses", self.poses, Sequence[Pose])
+        check_kind("scale", self.scale, RelativeScale)
 
 
 class RelativeErrors(NamedTuple):
