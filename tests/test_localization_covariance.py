@@ -298,7 +298,8 @@ def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
 def test_near_points_bring_the_range_nearer_at_which_moves_act(near, expected):
     """By as much as they are displaced more; but hardly by what is as near as no camera stands."""
     offsets = np.zeros((3, 2000), np.float32)
-    offsets[0, :1000], offsets[1, 1000:] = near, 3.0
+    offsets[0, :1000] = near
+    offsets[1, 1000:] = 3.0
     found = covariance.compute_acting_range(SimpleNamespace(offsets=offsets))
     assert found == pytest.approx(expected, rel=1e-3)
 

@@ -27,7 +27,9 @@ def _small_photos(monkeypatch):
 
 @pytest.mark.parametrize("kind", PLACE_KINDS)
 def test_a_seed_makes_one_open_place_and_another_makes_another(kind):
-    place, again, other = make_place(kind, 3), make_place(kind, 3), make_place(kind, 4)
+    place = make_place(kind, 3)
+    again = make_place(kind, 3)
+    other = make_place(kind, 4)
     np.testing.assert_array_equal(place.room.boxes, again.room.boxes)
     np.testing.assert_array_equal(place.room.materials, again.room.materials)
     assert place.room.boxes.shape != other.room.boxes.shape or (place.room.boxes != other.room.boxes).any()

@@ -122,7 +122,8 @@ def test_sphere_and_scan_show_the_same_in_every_direction(made):
     document = document_of(made)
     for name in ("000.jpg", "001.jpg", "walk_3.jpg"):
         pictures = pictures_of(made, photo_named(document, name))
-        sphere, scan = decode_picture(pictures["sphere"]), decode_picture(pictures["scan"])
+        sphere = decode_picture(pictures["sphere"])
+        scan = decode_picture(pictures["scan"])
         assert sphere.shape == scan.shape == (64, 128, 3)
         blurred = [cv2.GaussianBlur(p, (0, 0), 1.5).astype(float).ravel() for p in (sphere, scan)]
         turned = cv2.GaussianBlur(np.roll(scan, 8, axis=1), (0, 0), 1.5).astype(float).ravel()

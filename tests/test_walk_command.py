@@ -36,7 +36,8 @@ def queries(folder):
 
 
 def test_a_walk_is_done_again_from_a_frame_that_was_missing_or_failed(queries, tmp_path, monkeypatch, capsys):
-    late, out = tmp_path / "late.png", tmp_path / "a.jsonl"
+    late = tmp_path / "late.png"
+    out = tmp_path / "a.jsonl"
     frames = [str(queries[0].image), str(late), str(queries[1].image)]
     command = ["--walk", "--pano", *frames, "--times", "order", "--out", str(out)]
     assert run_localize(*command) == 3
@@ -155,7 +156,8 @@ def _times(folder, queries):
 
 def test_a_walk_that_was_stopped_goes_on_where_it_stood(folder, queries, tmp_path, monkeypatch, capsys):
     walk = ["--walk", "--pano", str(folder / "images"), "--times", _times(folder, queries), "--out"]
-    whole, stopped = tmp_path / "whole.jsonl", tmp_path / "stopped.jsonl"
+    whole = tmp_path / "whole.jsonl"
+    stopped = tmp_path / "stopped.jsonl"
     assert run_localize(*walk, str(whole)) == 0
     assert_right(read_results([whole]), queries)
     assert not steps_file(whole).exists()

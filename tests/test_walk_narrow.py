@@ -176,7 +176,8 @@ def test_a_local_optimum_comes_to_the_pose_by_the_photo_beside(seen, confirmed):
 
 
 def test_other_ends_make_a_narrow_photo_less_sure(seen):
-    near, far = State(tracked.off(seen[1], 0.05, 0.0), 1.0), State(tracked.off(seen[1], 0.2, 0.0), 1.5)
+    near = State(tracked.off(seen[1], 0.05, 0.0), 1.0)
+    far = State(tracked.off(seen[1], 0.2, 0.0), 1.5)
     best = State(seen[1], 2.0)
     assert choose_held([near, best]) == best
     weighed = choose_held([near, best, far])
@@ -186,7 +187,8 @@ def test_other_ends_make_a_narrow_photo_less_sure(seen):
 def test_a_narrow_photo_is_tracked_from_what_others_tell_within_reach(seen):
     true = seen[1]
     expected = tracked.expected(true, 1.0)
-    near, away = tracked.off(true, 0.3, 10.0), tracked.off(true, 9.0, 0.0)
+    near = tracked.off(true, 0.3, 10.0)
+    away = tracked.off(true, 9.0, 0.0)
     alike = [tracked.off(true, 0.2 * k, 0.0) for k in range(1, 7)]
     starts = list_starts(expected, 0.0, alike, True, [away, near])
     assert starts == [Start(pose, False) for pose in (true, near, *alike[:4])]
@@ -197,7 +199,8 @@ def test_all_places_where_a_narrow_photo_was_not_found_are_as_likely_as_none(see
     """Views do not tell them apart; of one that is sure they are less likely, of a whole photo they count."""
     problem, true = seen
     own = [State(true, 1.6, 0.5)]
-    unsure, sure = Result(), Result(LOCALIZED)
+    unsure = Result()
+    sure = Result(LOCALIZED)
     rough = [s.log_odds for s in list_key_states(tracked.narrow(problem), own, rooms.means(), unsure)[1:]]
     assert len(rough) > 3
     assert np.logaddexp.reduce(rough) <= -3.0 + 1e-9

@@ -99,7 +99,8 @@ def test_a_turn_at_its_end_tells_a_twin_corridor_if_the_motion_is_known():
     assert tracked.probabilities[0][0] > 0.99
     after.key = None
     after.arrived = None
-    before.odometry, after.odometry = make_pose(100, 0, 0, yaw=1.0), make_pose(100, 0, 0, yaw=1.0)
+    before.odometry = make_pose(100, 0, 0, yaw=1.0)
+    after.odometry = make_pose(100, 0, 0, yaw=1.0)
     turn = yaw_rotation(1.0).T
     after.odometry = Pose(after.odometry.R_cam_from_world, turn @ np.array([6.0, 0, 0]) + [100.0, 0, 0])
     measured = walk_path.build_lattice([before, after], Open(), MOTION).smooth()
@@ -107,10 +108,8 @@ def test_a_turn_at_its_end_tells_a_twin_corridor_if_the_motion_is_known():
 
 
 def test_a_motion_is_carried_to_where_the_camera_is():
-    begin, end = (
-        make_pose(1, 2, 3, yaw=0.4),
-        Pose(exp_so3(np.array([0.1, 0.2, 1.0])), np.array([2.0, 2.5, 3.0])),
-    )
+    begin = make_pose(1, 2, 3, yaw=0.4)
+    end = Pose(exp_so3(np.array([0.1, 0.2, 1.0])), np.array([2.0, 2.5, 3.0]))
     to = Pose(exp_so3(np.array([0.3, -0.2, 2.0])), np.array([-5.0, 0.0, 1.0]))
     carried = carry(end, begin, to)
     motion = np.linalg.solve(begin.T_world_from_cam, end.T_world_from_cam)
@@ -122,7 +121,8 @@ def test_a_motion_is_carried_to_where_the_camera_is():
 def test_known_motions_have_the_error_of_their_length():
     frames = [make_key(0, ((0, 0, 0), 5.0)), make_key(1, ((30, 0, 0), 5.0))]
     assert walk_path.motion_between(frames, 0, 1) is None
-    frames[0].odometry, frames[1].odometry = make_pose(0, 0, 0), make_pose(29, 0, 0)
+    frames[0].odometry = make_pose(0, 0, 0)
+    frames[1].odometry = make_pose(29, 0, 0)
     moved = walk_path.motion_between(frames, 0, 1)
     assert walk_path.is_moved(moved, frames[0].states, frames[1].states).tolist() == [[True]]
     frames[1].odometry = make_pose(27, 0, 0)

@@ -108,7 +108,8 @@ def shots_of_stereo(place: Place, rng: np.random.Generator) -> list[Shot]:
             heading = float(np.arctan2(*(place.focus - at)[::-1])) + 0.45 * (k % 5 - 2)
         up = np.radians(12.0) * (k % 2) + 0.03
         # columns are the camera's forward, left and up axes in the world
-        c, s = np.cos(heading), np.sin(heading)
+        c = np.cos(heading)
+        s = np.sin(heading)
         forward = np.array([c * np.cos(up), s * np.cos(up), np.sin(up)])
         left = np.array([-s, c, 0.0])
         axes = np.stack([forward, left, np.cross(forward, left)])
