@@ -4,6 +4,7 @@ import json
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
+from typing import TextIO
 
 import cv2
 import numpy as np
@@ -254,6 +255,23 @@ def trial_line(scene: str, trial: Trial, found: Result) -> dict[str, object]:
     }
 
 
+class TrialLog:
+    """Trials that are written as they come, with their cases for the table."""
+
+    def __init__(self, file: TextIO) -> None:
+        self.file = file
+        self.rows: list[Case] = []
+
+    def add(self, scene: str, trial: Trial, found: Result) -> Case:
+        """Write the line of a trial."""
+        truth = trial.true_pose
+        is_right = bool(truth and found.best_pose and RIGHT.holds(found.best_pose, truth))
+        self.rows.append((trial.case, found.status, is_right))
+        self.file.write(json.dumps(trial_line(scene, trial, found)) + "\n")
+        self.file.flush()
+        return self.rows[-1]
+
+
 def add_arguments(parser: ArgumentParser) -> None:
     """Add all options."""
     option(parser, "--seeds FIRST END", "seeds of synthetic rooms, END excluded", required=True)
@@ -272,17 +290,12 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(arguments: Arguments) -> int:
     """Localize every trial, write its line, print the table."""
     workers = Workers(arguments.threads)
-    rows: list[Case] = []
     with arguments.out.open("w") as file:
+        log = TrialLog(file)
         for scene, (points, colors), trials in all_trials(arguments, workers):
             cloud = stream_of_arrays(points.astype(np.float64), None if arguments.ignore_colors else colors)
             scan_map = prepare_map(cloud, workers, has_features=False)
             for trial in trials:
-                found = localize_trial(scan_map, trial, workers)
-                truth = trial.true_pose
-                ok = bool(truth and found.best_pose and RIGHT.holds(found.best_pose, truth))
-                rows.append((trial.case, found.status, ok))
-                file.write(json.dumps(trial_line(scene, trial, found)) + "\n")
-                file.flush()
-                arguments.note(f"{scene}: {trial.case}: {found.status}, {'right' if ok else 'wrong'}")
-    return 1 if print_cases("case", rows) else 0
+                case, status, is_right = log.add(scene, trial, localize_trial(scan_map, trial, workers))
+                arguments.note(f"{scene}: {case}: {status}, {'right' if is_right else 'wrong'}")
+    return 1 if print_cases("case", log.rows) else 0

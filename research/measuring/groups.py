@@ -1,6 +1,5 @@
 """Measure photos that are localized together: turns and bursts of a phone in made-up rooms, and strangers."""
 
-import json
 from argparse import ArgumentParser
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -11,7 +10,6 @@ from piccolo import CoarseToFineSettings, Photo
 from piccolo.camera.model import camera_of_fov
 from piccolo.cli.command import Arguments, option
 from piccolo.cloud.stream import stream_of_arrays
-from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Stopwatch, Workers, num_cores
 from piccolo.judge.result import Result
@@ -24,9 +22,9 @@ from piccolo.together.members import Shot
 
 from ..synthetic import handheld, layout, world as worlds
 from ..synthetic.places import ALIKE_KINDS, make_alike
-from .calibration import Case, print_cases
+from .calibration import print_cases
 from .claims import Trial
-from .confidence import localize_trial, remove_texture, trial_line
+from .confidence import TrialLog, localize_trial, remove_texture
 
 EPILOG = """\
 example:
@@ -122,16 +120,8 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(arguments: Arguments) -> int:
     """Localize the photos of every group, write their lines, print the table."""
     workers = Workers(arguments.threads)
-    rows: list[Case] = []
-
-    def keep(case: str, scene: str, trial: Trial, found: Result) -> None:
-        truth = trial.true_pose
-        ok = bool(truth and found.best_pose and RIGHT.holds(found.best_pose, truth))
-        rows.append((case, found.status, ok))
-        file.write(json.dumps(trial_line(scene, trial._replace(case=case), found)) + "\n")
-        file.flush()
-
     with arguments.out.open("w") as file:
+        log = TrialLog(file)
         for kind in arguments.kinds:
             for seed in range(*arguments.seeds):
                 world, groups = make_groups(kind, seed, arguments.strangers, workers)
@@ -139,9 +129,9 @@ def run(arguments: Arguments) -> int:
                 scan_map = prepare_map(stream_of_arrays(points.astype(np.float64), colors), workers)
                 for case, photos, sphere in groups:
                     scene = f"{kind} {seed}"
-                    keep(sphere.case, scene, sphere, localize_trial(scan_map, sphere, workers))
+                    log.add(scene, sphere, localize_trial(scan_map, sphere, workers))
                     for way, trial, found in localize_each(scan_map, photos, workers):
                         strange = "" if trial.true_pose else ", strangers"
-                        keep(f"{case}{strange}, {way}", scene, trial, found)
+                        log.add(scene, trial._replace(case=f"{case}{strange}, {way}"), found)
                     arguments.note(f"{scene}: {case}")
-    return 1 if print_cases("case", rows) else 0
+    return 1 if print_cases("case", log.rows) else 0
