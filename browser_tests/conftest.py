@@ -12,6 +12,7 @@ from playwright.sync_api import sync_playwright
 ROOT = Path(__file__).resolve().parents[1]
 sys.path += [str(ROOT), str(ROOT / "tests")]
 
+from dropping import SLOW_MS, serving  # noqa: E402
 from report_scenes import HOSTILE, House, mixed_house  # noqa: E402
 
 from piccolo.cli import localize, report  # noqa: E402
@@ -160,3 +161,36 @@ def hostile(tmp_path_factory):
     assert report.main([*words, "--out", str(folder / "report")]) == 0
     assert report.main([*words, "--out", str(folder / "report.html"), "--self-contained"]) == 0
     return folder / "report" / "index.html", folder / "report.html"
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="session")
+def service(cache):
+    """The address of a service that keeps nothing."""
+    with serving(cache) as address:
+        yield address
+
+
+@pytest.fixture
+def visit(browser, service):
+    """A function that opens the service's page."""
+    with opening(browser, (service, "data:", "blob:"), is_strict=False) as visit:
+
+        def open_page(width=1400, height=860, **more):
+            page = visit(service, width, height, **more)
+            page.set_default_timeout(SLOW_MS)
+            return page
+
+        yield open_page
+
+
+@pytest.fixture(scope="session")
+def elsewhere(tmp_path_factory):
+    """A panorama of a room that is not in the scan."""
+    house = House(tmp_path_factory.mktemp("elsewhere"), 1024)
+    house.add(0, "elsewhere.jpg")
+    return house.folder / "photos" / "elsewhere.jpg"

@@ -1,12 +1,14 @@
-"""A result with all its fields set."""
+"""Results: one with all its fields set, and those of photos of a phone."""
 
 import numpy as np
 
+from piccolo.camera import Mount
+from piccolo.camera.model import pinhole
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.judge.belief import make_belief
 from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.judge.result import Result
-from piccolo.judge.result_parts import Alternative, Evidence, Source
+from piccolo.judge.result_parts import Alternative, Beside, Evidence, Source
 
 POSE = Pose(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([500_000.123, 4_000_000.456, 12.0]))
 EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.6, 0.9, 0.5)
@@ -31,3 +33,16 @@ RESULT = Result(
     storey=2,
     height_above_floor=1.51,
 )
+
+PHONE = (Mount(pinhole(1024, 512, 400.0)),)
+NONE_ASKED = Beside((), "0" * 64)
+NOWHERE = Pose(np.eye(3), np.zeros(3))
+
+
+def phone_result(pano, status="localized", beside=None, cameras=PHONE, confidence=0.95):
+    """The result of a photo of a phone; nothing of its pose matters."""
+    source = Source(None, "1" * 64, (1024, 512))
+    about = {"beside": beside, "cameras": cameras, "source": source}
+    if status in ("unreadable", "failed"):
+        return Result(status, 0.0, "a.ply", pano, error="it is broken", source=source)
+    return Result(status, confidence, "a.ply", pano, NOWHERE, **about)

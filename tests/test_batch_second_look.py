@@ -18,10 +18,10 @@ from batches import untimed
 from camera_room import SEED, place
 from pictures import encoded, write
 from poses import judged
+from results import PHONE
 
 from piccolo import open_scan, second_look
 from piccolo.batch.localizer import Localizer
-from piccolo.batch.results_file import StreamOutput
 from piccolo.camera import Mount
 from piccolo.camera.calibration import document_of
 from piccolo.camera.model import pinhole
@@ -32,28 +32,15 @@ from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.pose_covariance import describe_errors
-from piccolo.judge.result import Result
-from piccolo.judge.result_parts import Beside, Source
+from piccolo.judge.result_parts import Beside
 from piccolo.photo import Photo
 from piccolo.result_files import read_results
 from piccolo.scan import Scan
 from piccolo.second_look import Looking, Others
-from piccolo.together.second_looks import MOST_PICTURES, Look, list_looks_beside, localize_in_order
+from piccolo.together.second_looks import Look
 from research.synthetic.world import render_picture
 
 TIER = "scene"
-
-PHONE = (Mount(pinhole(1024, 512, 400.0)),)
-NONE_ASKED = Beside((), "0" * 64)
-NOWHERE = Pose(np.eye(3), np.zeros(3))
-
-
-def _result(pano, status="localized", beside=None, cameras=PHONE, confidence=0.95):
-    source = Source(None, "1" * 64, (1024, 512))
-    about = {"beside": beside, "cameras": cameras, "source": source}
-    if status in ("unreadable", "failed"):
-        return Result(status, 0.0, "a.ply", pano, error="it is broken", source=source)
-    return Result(status, confidence, "a.ply", pano, NOWHERE, **about)
 
 
 def test_a_doubtful_photo_is_sure_beside_another(tmp_path):
@@ -84,73 +71,6 @@ def test_a_doubtful_photo_is_sure_beside_another(tmp_path):
     task = localizer.task(photos / "narrow.png")
     again = localizer.answer_in(rooms.scan(SEED))(task._replace(look=look))
     assert again.result == replace(before, beside=Beside((), "1"))
-
-
-def test_doubtful_phone_photos_are_looked_at_beside_sure_ones():
-    """What was localized beside others is no picture for others; spheres are not looked at again."""
-    statuses = ("localized", "ambiguous", "not_localized", "unreadable", "failed")
-    results = [_result(f"{k}", status) for k, status in enumerate(statuses)]
-    results += [_result("5", beside=Beside(("0",), "0" * 64)), _result("6", cameras=())]
-    results += [_result("7", "ambiguous", cameras=()), _result("8", "not_localized", NONE_ASKED)]
-    results += [_result("9", confidence=0.94)]
-    looks = list_looks_beside(results)
-    assert [(look.number, look.pano, look.first) for look in looks] == [
-        (1, "1", results[1]),
-        (2, "2", results[2]),
-        (5, "5", None),
-        (8, "8", results[8]),
-    ]
-    assert all(look.beside == (results[0], results[6]) for look in looks)
-    results[1] = _result("1", "ambiguous", Beside((), looks[0].asked_sha256))
-    assert [look.number for look in list_looks_beside(results)] == [2, 5, 8]
-    results[6] = _result("6", "ambiguous")
-    assert [look.number for look in list_looks_beside(results)] == [1, 2, 5, 6, 8]
-    assert [(look.number, look.beside) for look in list_looks_beside(results[1:6])] == [(0, ()), (4, ())]
-
-
-def test_a_photo_is_looked_at_beside_the_nearest_in_order():
-    results = [_result(f"{k}", "ambiguous" if k == 40 else "localized") for k in range(MOST_PICTURES + 30)]
-    (look,) = list_looks_beside(results)
-    assert look.beside == tuple(one for k, one in enumerate(results) if k != 40 and k <= MOST_PICTURES)
-
-
-def test_lines_on_a_stream_keep_their_order_and_wait_for_one_that_may_change():
-    texts = [
-        _result(f"{k}", status).to_json() for k, status in enumerate(("localized", "ambiguous", "localized"))
-    ]
-    surer = _result("surer").to_json()
-    for may_change, before in ((True, texts[:1]), (False, texts)):
-        written = []
-        output = StreamOutput(written.append, may_change)
-        for text in texts:
-            output.write(text)
-        assert written == before
-        if may_change:
-            output.replace(1, surer)
-            assert [one.pano for one in output.results()] == ["0", "surer", "2"]
-        output.close()
-        assert written == ([texts[0], surer, texts[2]] if may_change else texts)
-
-
-def test_results_come_in_order_and_wait_for_one_that_may_change():
-    statuses = ("localized", "ambiguous", "localized")
-    asked = []
-
-    def localize(k):
-        asked.append(k)
-        return _result(f"{k}", statuses[k])
-
-    def look_again(k, look):
-        assert [one.pano for one in look.beside] == ["0", "2"]
-        return replace(look.first, status="localized", beside=Beside(("0",), look.asked_sha256))
-
-    found = localize_in_order(range(3), localize, look_again, 0.9)
-    assert next(found).pano == "0"
-    assert asked == [0]
-    second, third = found
-    assert asked == [0, 1, 2]
-    assert (second.pano, second.status, second.beside.photos) == ("1", "localized", ("0",))
-    assert third == _result("2")
 
 
 @pytest.fixture
