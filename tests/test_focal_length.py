@@ -22,6 +22,7 @@ from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import Selection
+from piccolo.judge.claim import Told
 from piccolo.judge.result_parts import Alternative, Evidence, FocalLength
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import localize as module
@@ -132,6 +133,11 @@ def test_each_source_of_a_focal_length_has_its_deviation():
     assert _panorama(np.zeros((64, 128, 3), np.uint8)).focal_prior is None
 
 
+def _estimate(values, information):
+    """What independent blocks without number tell of a lens."""
+    return Estimate(Told(values, information, np.zeros((0, 5, 5))), np.ones((6, 5)))
+
+
 @pytest.mark.parametrize(
     ("minimum", "share", "std"),
     [(0.01, 0.5, 0.0071), (0.021, 0.5, 0.0071), (0.03, 0.88, 0.0096), (0.065, 0.97, 0.0101)],
@@ -141,13 +147,13 @@ def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(minimum, shar
     panorama = _panorama(_photo(pinhole(320, 240, TRUE))[0], focal_px=TRUE)
     camera = panorama.cameras[0].camera
     information = np.diag([1.0 / 0.01**2, 0.0, 0.0, 0.0, 0.0])
-    found = Estimate(np.array([minimum, 0.0, 0.0, 0.0, 0.0]), information, np.ones((6, 5)))
+    found = _estimate(np.array([minimum, 0.0, 0.0, 0.0, 0.0]), information)
     fit = focal.weigh_claim(panorama.focal_prior, camera, found, found)
     assert fit.conflict == pytest.approx(minimum / 0.01 / math.sqrt(2.0), rel=0.02)
     assert fit.change[0] / minimum == pytest.approx(share, abs=0.02)
     assert fit.deviation == pytest.approx(std, rel=0.03)
     assert (fit.of_difference[0, 0] > 1e-6) == (minimum == 0.021)  # beyond two they are in the deviation
-    nothing = found._replace(information=np.zeros((5, 5)))
+    nothing = _estimate(found.told.values, np.zeros((5, 5)))
     open_fit = focal.weigh_claim(panorama.focal_prior, camera, nothing, nothing)
     assert (open_fit.change[0], open_fit.deviation, open_fit.conflict) == (0.0, pytest.approx(0.01), 0.0)
 
@@ -156,7 +162,7 @@ def test_what_other_photos_tell_is_not_doubted_by_one_of_them():
     """Its confidence would follow a millimetre of theirs: from 3.3 to 4 deviations a doubt is 0.4 to 0.9."""
     given = _panorama(_photo(pinhole(320, 240, TRUE))[0], focal_px=TRUE)
     first = np.eye(5)[0]
-    found = Estimate(0.04 * first, np.diag(1e4 * first), np.ones((6, 5)))
+    found = _estimate(0.04 * first, np.diag(1e4 * first))
     by_others = given.expect_focal(TRUE, 0.004)
     alone, beside = (
         focal.weigh_claim(panorama.focal_prior, panorama.cameras[0].camera, found, found)

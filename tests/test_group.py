@@ -11,13 +11,16 @@ from groups import SEED, taken_photos
 
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.judge.candidate import NO_CANDIDATE
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.panorama import Panorama
-from piccolo.together.group import localize_group
+from piccolo.together.bundle_search import Support
+from piccolo.together.group import localize_group, weigh_supports
 from piccolo.together.links import FIRM, WEAK, Links, Placed, compute_shared, find_links, list_pairs, spread
 from piccolo.together.members import Shot
 
 TIER = "scene"
+SUPPORT = Support(NO_CANDIDATE, None, is_found=True, odds=1.0, odds_elsewhere=0.0, num_places=100)
 
 
 def _sphere(num, seed):
@@ -61,21 +64,39 @@ def _facing(heading_deg):
     return SimpleNamespace(photo=photo), pose
 
 
+def _show_the_same(*headings_deg):
+    """Links of photos with keypoints all over what they show, and the photos three metres from all of it."""
+    rays = _sphere(4000, 0).rays
+    rays = rays[np.abs(np.arctan2(rays[:, 1], rays[:, 0])) < np.radians(29.0)]
+    keypoints = Keypoints(rays, rays, np.ones(len(rays)), np.zeros((len(rays), 128), np.uint8))
+    photos = [_facing(heading) for heading in headings_deg]
+    problems = {k: problem for k, (problem, _) in enumerate(photos)}
+    links = Links(problems, dict.fromkeys(problems, keypoints), {}, rooms.WORKERS)
+    ranges = np.full(len(rays), 3.0, np.float32)
+    return links, {k: Placed(pose, ranges) for k, (_, pose) in enumerate(photos)}
+
+
 @pytest.mark.parametrize(
     ("turned_deg", "least", "most"), [(0.0, 0.95, 1.0), (30.0, 0.3, 0.7), (90.0, 0.0, 0.0)]
 )
 def test_what_photos_show_in_common_is_told_by_their_keypoints(turned_deg, least, most):
-    rays = _sphere(4000, 0).rays
-    rays = rays[np.abs(np.arctan2(rays[:, 1], rays[:, 0])) < np.radians(29.0)]
-    keypoints = Keypoints(rays, rays, np.ones(len(rays)), np.zeros((len(rays), 128), np.uint8))
-    photos = [_facing(0.0), _facing(turned_deg)]
-    links = Links(
-        {k: problem for k, (problem, _) in enumerate(photos)}, {0: keypoints, 1: keypoints}, {}, rooms.WORKERS
-    )
-    places = {k: Placed(pose, np.full(len(rays), 3.0, np.float32)) for k, (_, pose) in enumerate(photos)}
+    links, places = _show_the_same(0.0, turned_deg)
     assert least <= compute_shared(links, places, 0) <= most
-    nothing = {**places, 0: places[0]._replace(ranges=np.zeros(len(rays), np.float32))}
+    nothing = {**places, 0: places[0]._replace(ranges=np.zeros_like(places[0].ranges))}
     assert compute_shared(links, nothing, 0) == 0.0, "a bare wall is not known to be shown twice"
+
+
+def test_what_several_photos_show_counts_once_and_not_less():
+    """The photo that tells most of the place counts whole, however many show a part of the same."""
+    links, places = _show_the_same(0.0, 0.0, 0.0, 90.0)
+    odds = {0: 2.0, 1: 100.0, 2: 0.5, 3: 0.1}
+    supports = {k: SUPPORT._replace(odds=one) for k, one in odds.items()}
+    weights = {k: one.weight for k, one in weigh_supports(links, places, supports).items()}
+    assert list(weights) == [0, 1, 2, 3]
+    assert weights[1] == 1.0
+    assert weights[0] == pytest.approx(1.0 / 2.0, abs=0.02)
+    assert weights[2] == pytest.approx(1.0 / 3.0, abs=0.02)
+    assert weights[3] == 1.0, "it shows something else"
 
 
 @functools.lru_cache

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import rooms
 from rooms import as_panorama
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from piccolo.camera import Camera, Mount
@@ -19,7 +20,7 @@ from piccolo.evidence.sphere import CLAIM, SphereFit, count_deviations
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.pose_gaussian import probability_of_ball
 from piccolo.geometry.sphere import compute_pixels
-from piccolo.judge.claim import Claim, marginal
+from piccolo.judge.claim import Claim, Told, marginal
 from piccolo.judge.result import Result
 from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.optimize.self_calibration import sum_free_equations
@@ -184,6 +185,26 @@ def _claim(count=2):
     return Claim(np.zeros(count), np.full(count, 0.01), np.full(count, 0.1), np.full(count, 0.02))
 
 
+def _tell(values, information):
+    """What independent blocks without number tell."""
+    return Told(values, information, np.zeros((0, len(values), len(values))))
+
+
+def test_what_few_blocks_tell_contradicts_a_claim_less():
+    """By Student's distribution of as many degrees of freedom; not where the claim itself is the vaguer."""
+    claim = _claim(1)
+    information = np.array([[1.0 / 0.1**2]])
+    off = np.array([4.0 * math.hypot(0.1, 0.01)])
+    for num_blocks in (3, 8, 1000):
+        told = Told(off, information, np.ones((num_blocks, 1, 1)))
+        chance = 2.0 * stats.t.sf(4.0, num_blocks)
+        assert claim.conflict(told) == pytest.approx(stats.norm.isf(0.5 * chance), rel=0.03)
+    uneven = Told(off, information, np.array([1.0, *[1e-6] * 20])[:, None, None])
+    assert claim.conflict(uneven) < 2.0
+    exact = Told(np.array([0.04]), np.array([[1.0 / 0.001**2]]), np.ones((3, 1, 1)))
+    assert claim.conflict(exact) == pytest.approx(4.0, rel=0.02)
+
+
 def test_a_claim_is_doubted_as_far_as_the_picture_contradicts_it():
     """As by the formula for one correction; of two that the picture tells together, each by itself."""
     one = _claim(1)
@@ -192,25 +213,26 @@ def test_a_claim_is_doubted_as_far_as_the_picture_contradicts_it():
     for off in (0.0, 0.03, -0.06):
         odds = 0.02 / 0.98 * math.sqrt(spread / (spread + 0.01))
         odds *= math.exp(0.5 * off**2 * (1.0 / spread - 1.0 / (spread + 0.01)))
-        assert one.doubt(np.array([off]), information) == pytest.approx(odds / (1.0 + odds))
-        assert one.conflict(np.array([off]), information) == pytest.approx(abs(off) / math.sqrt(spread))
+        told = _tell(np.array([off]), information)
+        assert one.doubt(told) == pytest.approx(odds / (1.0 + odds))
+        assert one.conflict(told) == pytest.approx(abs(off) / math.sqrt(spread))
     two = _claim()
     together = np.linalg.inv(0.02**2 * np.array([[1.0, 0.9], [0.9, 1.0]]))
-    alike = two.conflict(np.array([0.05, 0.05]), together)
-    apart = two.conflict(np.array([0.05, -0.05]), together)
+    alike = two.conflict(_tell(np.array([0.05, 0.05]), together))
+    apart = two.conflict(_tell(np.array([0.05, -0.05]), together))
     assert apart > 2.0 * alike
-    assert two.conflict(np.array([1.0, 1.0]), np.zeros((2, 2))) == pytest.approx(0.0)
+    assert two.conflict(_tell(np.array([1.0, 1.0]), np.zeros((2, 2)))) == pytest.approx(0.0)
 
 
 def test_a_correction_by_the_picture_has_the_others_as_claimed():
     claim = _claim()
     values = np.array([0.03, 0.02])
     covariance = np.array([[4e-4, 3e-4], [3e-4, 9e-4]])
-    off, variance = marginal(values, np.linalg.inv(covariance), claim, 0)
+    off, variance = marginal(_tell(values, np.linalg.inv(covariance)), claim, 0)
     gain = covariance[0, 1] / (covariance[1, 1] + 0.01**2)
     assert off == pytest.approx(values[0] - gain * values[1], rel=1e-6)
     assert variance == pytest.approx(covariance[0, 0] - gain * covariance[0, 1], rel=1e-6)
-    assert marginal(values, np.zeros((2, 2)), claim, 0)[1] == math.inf
+    assert marginal(_tell(values, np.zeros((2, 2))), claim, 0)[1] == math.inf
 
 
 def test_the_probability_of_a_ball_is_that_of_draws():
@@ -267,13 +289,14 @@ def test_a_panorama_as_it_is_has_no_geometry_to_tell_of():
 def test_a_claim_that_holds_widens_a_pose_by_what_picture_and_claim_leave_open():
     motion = np.zeros((6, 3))
     motion[5, 2] = 4.0  # metres up by a radian of the horizon
-    sharp = Estimate(np.zeros(3), np.diag([1e8, 1e8, 1e8]), motion)
+    sharp = Estimate(_tell(np.zeros(3), np.diag([1e8, 1e8, 1e8])), motion)
     camera = whole_sphere(512, 256)
     held = SphereFit(camera, sharp, is_claimed=True)
     assert math.sqrt(held.pose_covariance[5, 5]) == pytest.approx(4e-4, rel=0.01)
-    blind = held._replace(estimate=sharp._replace(information=np.zeros((3, 3))))
+    blind = held._replace(estimate=sharp._replace(told=_tell(np.zeros(3), np.zeros((3, 3)))))
     assert math.sqrt(blind.pose_covariance[5, 5]) == pytest.approx(4.0 * CLAIM.deviations[2], rel=0.01)
-    off = held._replace(estimate=sharp._replace(values=np.array([0.0, 0.0, 0.002])))
+    told = sharp.told._replace(values=np.array([0.0, 0.0, 0.002]))
+    off = held._replace(estimate=sharp._replace(told=told))
     assert math.sqrt(off.pose_covariance[5, 5]) == pytest.approx(0.008, rel=0.03)
     assert count_deviations(off.estimate) == pytest.approx(0.002 / CLAIM.deviations[2], rel=0.01)
 

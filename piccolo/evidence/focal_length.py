@@ -161,16 +161,16 @@ def weigh_claim(prior: FocalPrior, camera: Camera, estimate: Estimate, free: Est
     That is an estimate with the focal length free, and one with all corrections of the lens free.
     """
     claim = make_claim(prior, camera)
-    values, information, motion = estimate
-    off, variance = marginal(values, information, claim, FOCAL)
+    told, motion = estimate
+    off, variance = marginal(told, claim, FOCAL)
     off -= claim.expected[FOCAL]
     opinion = Opinion(off, variance) if variance < MOST_VARIANCE else None
-    opinions = estimate, free
-    tests = [claim.contradict(*told[:2])[0] for told in opinions]
+    opinions = estimate.told, free.told
+    tests = [claim.contradict(one)[0] for one in opinions]
     worst = np.abs(tests).max(axis=0)
     change, total, difference = average(prior, claim, estimate, opinion, float(worst.max()))
     fitted = FITTED if fits_radial(prior, camera) else FITTED[:1]
-    rest = [k for k in range(len(values)) if k not in fitted]
+    rest = [k for k in range(len(told.values)) if k not in fitted]
     spread = total[np.ix_(rest, rest)] + np.outer(change[rest], change[rest])
     return FocalFit(
         change[fitted],
@@ -178,7 +178,7 @@ def weigh_claim(prior: FocalPrior, camera: Camera, estimate: Estimate, free: Est
         motion[:, fitted],
         opinion,
         float(worst.max()),
-        0.0 if prior.is_measured else max(claim.doubt(*told[:2]) for told in opinions),
+        0.0 if prior.is_measured else max(claim.doubt(one) for one in opinions),
         np.asarray(motion[:, rest] @ spread @ motion[:, rest].T),
         None if prior.is_measured or prior.deviation > WIDE else find_errors_of_picture(free, claim),
         LENS[int(worst.argmax())],
@@ -207,15 +207,17 @@ def average(
         wide[FOCAL] = 1.0 / max(opinion.off**2 - opinion.variance, prior.deviation**2)
     if conflict > DISAGREE:
         precision = wide  # the picture says where to look next
-    goal = estimate.information @ estimate.values + precision * claim.expected
-    total = np.linalg.inv(estimate.information + np.diag(precision))
-    return total @ goal, np.asarray(total), np.linalg.inv(estimate.information + np.diag(wide)) - total
+    values, information, _ = estimate.told
+    goal = information @ values + precision * claim.expected
+    total = np.linalg.inv(information + np.diag(precision))
+    return total @ goal, np.asarray(total), np.linalg.inv(information + np.diag(wide)) - total
 
 
 def find_errors_of_picture(estimate: Estimate, claim: Claim) -> Array:
     """Return what the corrections would add to a pose's covariance (6, 6) if nothing of the claim holds."""
-    covariance = np.linalg.inv(estimate.information + np.diag(claim.wrong_deviations**-2.0))
-    off = covariance @ estimate.information @ (estimate.values - claim.expected)
+    values, information, _ = estimate.told
+    covariance = np.linalg.inv(information + np.diag(claim.wrong_deviations**-2.0))
+    off = covariance @ information @ (values - claim.expected)
     return np.asarray(estimate.motion @ (covariance + np.outer(off, off)) @ estimate.motion.T)
 
 
@@ -312,7 +314,7 @@ def estimate_lens(problem: Problem, pose: Pose, end: FreeEnd, by_matches: MatchF
     """
     estimate = estimate_corrections(end)
     if end.pose.distance(pose) > FAR_AWAY:
-        estimate = estimate._replace(information=np.zeros_like(estimate.information))
+        estimate = inform(estimate, np.zeros_like(estimate.told.information))
     camera = problem.given.cameras[0].camera
     per_px = math.tau * camera.focal[0] / (0.5 * camera.width * problem.photo.panorama.rgb.shape[1])
     estimate = add_errors(estimate, (problem.method.edge_error * per_px) ** 2 * np.eye(len(LENS)))
@@ -325,6 +327,11 @@ def estimate_lens(problem: Problem, pose: Pose, end: FreeEnd, by_matches: MatchF
 
 def add_errors(estimate: Estimate, errors: Array) -> Estimate:
     """Return an estimate with further errors (5, 5); what it does not tell stays so."""
-    is_known = estimate.information.any(axis=1)
-    covariance = invert(estimate.information) + errors * np.outer(is_known, is_known)
-    return estimate._replace(information=invert(covariance))
+    is_known = estimate.told.information.any(axis=1)
+    covariance = invert(estimate.told.information) + errors * np.outer(is_known, is_known)
+    return inform(estimate, invert(covariance))
+
+
+def inform(estimate: Estimate, information: Array) -> Estimate:
+    """Return an estimate that has another information (5, 5)."""
+    return estimate._replace(told=estimate.told._replace(information=information))

@@ -36,11 +36,12 @@ class MatchFit(NamedTuple):
 
 def add_matches(estimate: Estimate, by_matches: MatchFit) -> Estimate:
     """Return the estimate with the focal length that matches tell."""
-    of_matches = np.zeros_like(estimate.information)
+    told = estimate.told
+    of_matches = np.zeros_like(told.information)
     of_matches[FOCAL, FOCAL] = by_matches.information
-    both = estimate.information + of_matches
-    goal = estimate.information @ estimate.values + of_matches @ by_matches.values
-    return estimate._replace(values=invert(both) @ goal, information=both)
+    both = told.information + of_matches
+    goal = told.information @ told.values + of_matches @ by_matches.values
+    return estimate._replace(told=told._replace(values=invert(both) @ goal, information=both))
 
 
 def fit_matches(

@@ -12,6 +12,7 @@ import numpy as np
 from ..arrays import Array, Array32, Int64s
 from ..camera.corrections import Corrections
 from ..geometry.pose import Pose, step
+from ..judge.claim import Told
 from ..optimize.channel_loss import ChannelProblem
 from ..optimize.gauss_newton import Equations, minimize
 from ..optimize.self_calibration import NUM_OF_POSE, FreeSums, sum_free_equations
@@ -50,10 +51,9 @@ class FreeEnd(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Corrections by the photo and the scan alone."""
+    """Corrections by the photo and the scan alone, and how the pose moves with them."""
 
-    values: Array  # (p,)
-    information: Array  # (p, p) inverse of their covariance
+    told: Told
     motion: (
         Array  # (6, p) of the pose with them: rotation about the camera's axes [rad], centre in the map [m]
     )
@@ -129,7 +129,9 @@ def estimate_corrections(end: FreeEnd, curvature: float = CURVATURE) -> Estimate
     covariance = (inverse @ gradients.T @ gradients @ inverse)[NUM_OF_POSE:, NUM_OF_POSE:]
     motion = -np.linalg.pinv(matrix[:NUM_OF_POSE, :NUM_OF_POSE]) @ matrix[:NUM_OF_POSE, NUM_OF_POSE:]
     motion[3:] = end.pose.R_cam_from_world.T @ motion[3:]
-    return Estimate(end.values, invert(covariance), np.asarray(motion))
+    by_slopes = inverse[NUM_OF_POSE:]
+    of_blocks = by_slopes @ end.sums.matrices[shown] @ by_slopes.T
+    return Estimate(Told(end.values, invert(covariance), of_blocks), np.asarray(motion))
 
 
 def displace_blocks(end: FreeEnd, variance: Array) -> Array:

@@ -56,13 +56,15 @@ class SphereFit(NamedTuple):
     def covariance(self) -> Array:
         """Covariance (3, 3) of the corrections: also by the claim, where that is used."""
         precision = np.diag(CLAIM.precision) if self.is_claimed else 1e-6 * np.eye(3)
-        return np.asarray(np.linalg.inv(self.estimate.information + precision))
+        return np.asarray(np.linalg.inv(self.estimate.told.information + precision))
 
     @property
     def pose_covariance(self) -> Array:
         """Covariance (6, 6) that the geometry adds to a pose: rotation, then centre in the map."""
         covariance = self.covariance
-        values, information, motion = self.estimate
+        told, motion = self.estimate
+        values = told.values
+        information = told.information
         off = covariance @ information @ values  # which is not applied
         beyond = max(1.0 - BY_CHANCE / max(float(values @ information @ values), BY_CHANCE), 0.0)
         return np.asarray(motion @ (covariance + beyond * np.outer(off, off)) @ motion.T)
@@ -91,8 +93,8 @@ def make_freedom(camera: Camera) -> Freedom:
 
 def count_deviations(estimate: Estimate) -> float:
     """Return how many deviations the most contradicted correction is from what is claimed."""
-    variances = np.diag(invert(estimate.information))
-    return float((np.abs(estimate.values) / np.sqrt(CLAIM.deviations**2 + variances)).max())
+    variances = np.diag(invert(estimate.told.information))
+    return float((np.abs(estimate.told.values) / np.sqrt(CLAIM.deviations**2 + variances)).max())
 
 
 def search_geometry(problem: Problem, pose: Pose, claimed: Camera, workers: Workers) -> FreeEnd:

@@ -4,9 +4,21 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import ndtri, stdtr
 
 from ..arrays import Array
 from .consensus import MOST_LOG
+
+LEAST_CHANCE = 1e-300  # that a distribution is asked for
+MANY = 1e12  # degrees of freedom of what is known
+
+
+class Told(NamedTuple):
+    """Corrections (p,) of a geometry by a picture and a scan alone."""
+
+    values: Array  # (p,)
+    information: Array  # (p, p) inverse of their covariance
+    of_blocks: Array  # (B, p, p) parts of the covariance that independent blocks would have by chance
 
 
 class Claim(NamedTuple):
@@ -25,40 +37,58 @@ class Claim(NamedTuple):
         """Inverse variances (p,)."""
         return np.asarray(self.deviations**-2.0)
 
-    def contradict(self, values: Array, information: Array) -> tuple[Array, Array]:
+    def contradict(self, told: Told) -> tuple[Array, Array]:
         """Return by how many deviations each correction (p,) is wrong if only it is, and their inverse.
 
-        `values` (p,) are those of the picture, `information` (p, p) is the inverse of their covariance. It is
-        the score test (Rao, 1948) of each correction, the others as claimed; the inverse deviation is that of
-        the score.
+        It is the score test (Rao, 1948) of each correction, the others as claimed; the inverse deviation is
+        that of the score. What few blocks tell has a deviation that is hardly known: the deviations are those
+        of a normal distribution that are as rare as what was found is by Student's.
         """
         P = np.diag(self.precision)
-        S = P - P @ np.linalg.inv(information + P) @ P  # inverse of the covariance of picture less claim
-        scores = S @ (values - self.expected)
+        S = P - P @ np.linalg.inv(told.information + P) @ P  # inverse of the covariance of picture less claim
+        scores = S @ (told.values - self.expected)
         inverse = np.sqrt(np.maximum(np.diag(S), 1e-300))
-        return np.asarray(scores / inverse), np.asarray(inverse)
+        of_picture = np.maximum(1.0 - np.einsum("ij,ij,i->j", S, S, 1.0 / np.diag(P)) / inverse**2, 0.0)
+        freedom = count_freedom(told.of_blocks, S) / np.maximum(of_picture, 1e-6) ** 2
+        return np.sign(scores) * as_normal(np.abs(scores) / inverse, freedom), np.asarray(inverse)
 
-    def doubt(self, values: Array, information: Array) -> float:
+    def doubt(self, told: Told) -> float:
         """Return the probability that the claim is wrong in one respect, by the odds of each."""
-        conflicts, inverse = self.contradict(values, information)
+        conflicts, inverse = self.contradict(told)
         wide = 1.0 + (self.wrong_deviations * inverse) ** 2  # of the variance, where it is wrong
         logs = np.minimum(0.5 * conflicts**2 * (1.0 - 1.0 / wide), MOST_LOG)
         odds = float(np.sum(self.wrong_shares / (1.0 - self.wrong_shares) * np.exp(logs) / np.sqrt(wide)))
         return odds / (1.0 + odds)
 
-    def conflict(self, values: Array, information: Array) -> float:
+    def conflict(self, told: Told) -> float:
         """Return the greatest number of deviations by which one correction is wrong."""
-        return float(np.abs(self.contradict(values, information)[0]).max())
+        return float(np.abs(self.contradict(told)[0]).max())
 
 
-def marginal(values: Array, information: Array, claim: Claim, k: int) -> tuple[float, float]:
+def count_freedom(of_blocks: Array, weights: Array) -> Array:
+    """Return the degrees of freedom (n,) of the variances of sums of corrections, weighed by (p, n).
+
+    They are those by Satterthwaite (1946) for an estimate from blocks (Bell and McCaffrey, 2002).
+    """
+    parts = np.einsum("in,bij,jn->bn", weights, of_blocks, weights)
+    squares = np.maximum(np.square(parts).sum(axis=0), LEAST_CHANCE)
+    freedom = np.square(parts.sum(axis=0)) / squares
+    return np.asarray(np.where(freedom > 0.0, freedom, MANY))
+
+
+def as_normal(deviations: Array, freedom: Array) -> Array:
+    """Return the deviations (n,) of a normal distribution that are as rare as others of Student's."""
+    return np.asarray(-ndtri(np.maximum(stdtr(freedom, -deviations), LEAST_CHANCE)))
+
+
+def marginal(told: Told, claim: Claim, k: int) -> tuple[float, float]:
     """Return value and variance of one correction by the picture, the others as claimed.
 
     The variance is infinite if the picture says nothing of it.
     """
     precision = claim.precision
     precision[k] = 1e-12
-    covariance = np.linalg.inv(information + np.diag(precision))
-    mean = covariance @ (information @ values + precision * claim.expected)
+    covariance = np.linalg.inv(told.information + np.diag(precision))
+    mean = covariance @ (told.information @ told.values + precision * claim.expected)
     variance = float(covariance[k, k])
     return float(mean[k]), variance if variance < 1e6 else math.inf

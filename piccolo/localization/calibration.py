@@ -141,8 +141,8 @@ def calibrate_sphere(
     other = retake_as_found(problem, found, camera, workers) if is_suspect else None
     if other is not None:
         return other
-    conflict = CLAIM.conflict(estimate.values, estimate.information)
-    doubt = CLAIM.doubt(estimate.values, estimate.information)
+    conflict = CLAIM.conflict(estimate.told)
+    doubt = CLAIM.doubt(estimate.told)
     return problem, found, SphereFit(camera, here, True, conflict, doubt)
 
 

@@ -25,7 +25,18 @@ from ..problem.accuracy import Demand
 from ..scan_map.scan_map import ScanMap
 from .bundle import EVEN_ODDS, judge_placed, place_between, weigh_local
 from .bundle_search import NUM_BUNDLES, Support, find_support, weigh_bundles
-from .links import FIRM, WEAK, Links, Places, are_bridged, compute_shared, find_links, find_pose, spread
+from .links import (
+    FIRM,
+    WEAK,
+    Links,
+    Placed,
+    Places,
+    are_bridged,
+    compute_shared,
+    find_links,
+    find_pose,
+    spread,
+)
 from .members import Member, Shot, find_members
 from .nearby import localize_nearby
 
@@ -198,19 +209,25 @@ def weigh_places(
 
 
 def examine_place(group: Group, places: Places, numbers: Collection[int], means: Means) -> Tested:
-    """Test a place in each of its photos, and in those that few matches put there.
-
-    What several photos show counts once.
-    """
+    """Test a place in each of its photos, and in those that few matches put there."""
     every = spread(group.links, places, numbers, WEAK)
     supports = {}
     for number, placed in every.items():
         member = group.members[number]
         support = find_support(member, member.found.problem.forget(), placed.pose, means.workers)
-        weight = 1.0 / (1.0 + compute_shared(group.links, every, number))
         belongs = support.belongs if number in places else BELONGS_WEAKLY
-        supports[number] = support._replace(weight=weight, belongs=belongs)
-    return Tested(every, supports)
+        supports[number] = support._replace(belongs=belongs)
+    return Tested(every, weigh_supports(group.links, every, supports))
+
+
+def weigh_supports(links: Links, places: Places, supports: Mapping[int, Support]) -> dict[int, Support]:
+    """Weigh the evidence of photos for a place: what several show counts once, by the one that tells most."""
+    counted: dict[int, Placed] = {}
+    weights = {}
+    for number in sorted(supports, key=lambda k: (-supports[k].odds, k)):
+        counted[number] = places[number]
+        weights[number] = 1.0 / (1.0 + compute_shared(links, counted, number))
+    return {number: one._replace(weight=weights[number]) for number, one in supports.items()}
 
 
 def judge_group(
