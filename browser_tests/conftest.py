@@ -1,5 +1,7 @@
 """Reports in Debian's Chromium, opened from disk: what they need, and what all of them must never do."""
 
+import functools
+import os
 import shutil
 import sys
 from contextlib import contextmanager
@@ -12,8 +14,9 @@ from playwright.sync_api import sync_playwright
 ROOT = Path(__file__).resolve().parents[1]
 sys.path += [str(ROOT), str(ROOT / "tests")]
 
-from dropping import SLOW_MS, serving  # noqa: E402
+from dropping import FLAT, SLOW_MS, serving  # noqa: E402
 from report_scenes import HOSTILE, House, mixed_house  # noqa: E402
+from services import Client  # noqa: E402
 
 from piccolo.cli import localize, report  # noqa: E402
 from piccolo.judge.result_parts import Source  # noqa: E402
@@ -96,8 +99,10 @@ def find_barriers():
 
 
 @pytest.fixture
-def shoot(request):
-    """A function that keeps a screenshot as an artifact of the test."""
+def shoot():
+    """A function that keeps a screenshot to look at, if the environment asks for SCREENSHOTS."""
+    if not os.environ.get("SCREENSHOTS"):
+        return lambda *_: None
     ARTIFACTS.mkdir(exist_ok=True)
     return lambda page, name: page.screenshot(path=ARTIFACTS / f"{name}.png")
 
@@ -173,6 +178,21 @@ def service(cache):
     """The address of a service that keeps nothing."""
     with serving(cache) as address:
         yield address
+
+
+@pytest.fixture(scope="session")
+def ask(service):
+    """A function that returns the service's answer to a photo of the sample; it is asked once."""
+    client = Client(int(service.split(":")[2].rstrip("/")), None)
+
+    @functools.cache
+    def ask(name, options="{}"):
+        content = (FLAT / "images" / f"{name}.jpg").read_bytes()
+        status, _, answer = client.post("/show", f"{name}.jpg", content, options)
+        assert status == 200
+        return answer
+
+    return ask
 
 
 @pytest.fixture

@@ -51,6 +51,11 @@ def answering(page, answer):
     page.unroute("**/show")
 
 
+def giving(answer):
+    """A function of a route that gives an answer that the service once gave."""
+    return lambda route: route.fulfill(status=200, content_type="application/x-ndjson", body=answer)
+
+
 def tell_place(page, x, y, radius):
     page.click(".drop >> text=Options")
     for name, value in (("x", x), ("y", y), ("radius", radius)):

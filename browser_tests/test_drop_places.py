@@ -3,7 +3,7 @@
 from functools import partial
 
 import pytest
-from dropping import FLAT, answering, choose, tell_place, wait_for
+from dropping import FLAT, answering, choose, giving, tell_place, wait_for
 
 # keeps the options that are sent in window.told
 LISTEN = """() => {
@@ -26,7 +26,7 @@ AHEAD = """() => {
 }"""
 
 
-def test_a_place_is_shown_on_the_plan(visit):
+def test_a_place_is_shown_on_the_plan(visit, ask):
     page = visit()
     page.click(".drop >> text=Options")
     page.click("text=Show the place on the plan")
@@ -48,8 +48,9 @@ def test_a_place_is_shown_on_the_plan(visit):
     assert page.locator(f".told >> text={told}").is_visible()  # it is told of the next ones too
     page.click(".told >> text=Clear")
     assert not page.locator(".told").is_visible()
-    choose(page, FLAT / "images" / "bedroom.jpg")
-    wait_for(page, "localized", "localized")
+    with answering(page, giving(ask("bedroom"))):
+        choose(page, FLAT / "images" / "bedroom.jpg")
+        wait_for(page, "localized", "localized")
     assert page.evaluate("told") == {}
 
 

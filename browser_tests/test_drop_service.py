@@ -4,7 +4,7 @@ from contextlib import contextmanager
 
 import pytest
 from conftest import opening
-from dropping import FLAT, PHONE, SLOW_MS, answering, choose, list_names, serving, wait_for
+from dropping import FLAT, PHONE, SLOW_MS, answering, choose, giving, list_names, serving, wait_for
 
 WITHOUT_PICTURES = """() => {
   const { get } = Object.getOwnPropertyDescriptor(XMLHttpRequest.prototype, "responseText");
@@ -25,27 +25,29 @@ ANSWERS = {
 }
 
 
-def test_a_slow_upload_is_not_called_unreadable(visit):
+def test_a_slow_upload_is_not_called_unreadable(visit, ask):
     page = visit()
     with answering(page, lambda route: route.fulfill(status=408, body=LATE)):
         choose(page, FLAT / "images" / "bedroom.jpg")
         page.wait_for_selector("#facts .verdict >> text=Sent too slowly")
     assert page.locator(".count.unreadable").count() == 0
-    page.click('.copy:has-text("Try again")')
-    wait_for(page, "localized")
+    with answering(page, giving(ask("bedroom"))):
+        page.click('.copy:has-text("Try again")')
+        wait_for(page, "localized")
     assert page.inner_text("#row-0 .row-status") == "Localized"
 
 
-def test_without_pictures_the_viewer_says_so(visit):
+def test_without_pictures_the_viewer_says_so(visit, ask):
     page = visit()
     page.evaluate(WITHOUT_PICTURES)
-    choose(page, FLAT / "images" / "bedroom.jpg")
-    wait_for(page, "localized")
+    with answering(page, giving(ask("bedroom"))):
+        choose(page, FLAT / "images" / "bedroom.jpg")
+        wait_for(page, "localized")
     page.wait_for_selector("text=pictures could not be loaded")
     assert page.locator("#row-0 img").get_attribute("src").startswith("blob:")
 
 
-def test_a_full_service_is_asked_again_and_a_lost_one_when_told_to(visit, shoot):
+def test_a_full_service_is_asked_again_and_a_lost_one_when_told_to(visit, ask, shoot):
     page = visit()
     busy = {"status": 503, "headers": {"Retry-After": "1"}, "body": '{"error": "found 32 photos that wait"}'}
     with answering(page, lambda route: route.fulfill(**busy)):
@@ -58,12 +60,13 @@ def test_a_full_service_is_asked_again_and_a_lost_one_when_told_to(visit, shoot)
     assert list_names(page) == ["bedroom", "bedroom (2)"]
     page.click("#row-1")
     shoot(page, "drop-lost")
-    page.click('.copy:has-text("Try again")')
-    wait_for(page, "localized", "localized")
+    with answering(page, giving(ask("bedroom"))):
+        page.click('.copy:has-text("Try again")')
+        wait_for(page, "localized", "localized")
 
 
 @pytest.mark.parametrize("status", ANSWERS)
-def test_what_gave_way_is_told(visit, shoot, status):
+def test_what_gave_way_is_told(visit, ask, shoot, status):
     page = visit()
     found, advice = ANSWERS[status]
     body = "<h1>Bad gateway</h1>" if status == 502 else f'{{"error": "{found}"}}'
@@ -73,8 +76,9 @@ def test_what_gave_way_is_told(visit, shoot, status):
     assert page.locator(f"#facts >> text={advice}").is_visible()
     assert "opens here" not in page.inner_text("#facts")
     shoot(page, f"drop-{status}")
-    page.click('.copy:has-text("Try again")')
-    wait_for(page, "localized")
+    with answering(page, giving(ask("bedroom"))):
+        page.click('.copy:has-text("Try again")')
+        wait_for(page, "localized")
 
 
 def test_a_slow_upload_shows_how_far_it_is(visit, tmp_path):
@@ -89,12 +93,13 @@ def test_a_slow_upload_shows_how_far_it_is(visit, tmp_path):
     page.wait_for_selector("#viewer[data-shown]")
 
 
-def test_a_reload_asks_before_it_loses_what_was_found(visit):
+def test_a_reload_asks_before_it_loses_what_was_found(visit, ask):
     page = visit()
     asked = []
     page.on("dialog", lambda dialog: asked.append(dialog.type))
-    choose(page, FLAT / "images" / "bedroom.jpg")
-    wait_for(page, "localized")
+    with answering(page, giving(ask("bedroom"))):
+        choose(page, FLAT / "images" / "bedroom.jpg")
+        wait_for(page, "localized")
     page.wait_for_selector("#viewer[data-shown]")
     assert page.locator(".copy:has-text('Copy link')").count() == 0  # it would open an empty page
     page.click("#plan")  # browsers ask only on pages that were used
@@ -141,11 +146,12 @@ def test_what_is_kept_is_there_again_and_links_open_it(browser, cache, tmp_path,
         assert sorted(list_names(page)) == ["bedroom", "living_room"]
 
 
-def test_the_answer_of_another_scan_is_not_shown_on_old_plans(visit):
+def test_the_answer_of_another_scan_is_not_shown_on_old_plans(visit, ask):
     page = visit()
     page.evaluate("PICCOLO_REPORT.scanSha256 = '0'.repeat(64)")  # as if it was loaded before
-    choose(page, FLAT / "images" / "bedroom.jpg")
-    page.wait_for_selector("#row-0 >> text=The scan was replaced")
+    with answering(page, giving(ask("bedroom"))):
+        choose(page, FLAT / "images" / "bedroom.jpg")
+        page.wait_for_selector("#row-0 >> text=The scan was replaced")
     assert "The scan was replaced after this page was loaded" in page.inner_text("#note")
     page.click("text=load the page again")
     page.wait_for_selector("body.no-photos")

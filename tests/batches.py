@@ -12,6 +12,21 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PAPER = ["--preset", "paper", "num_translations=4", "num_iterations=5", "max_points=5000"]
 
+# by which photos that colour the scan of a room are aligned and compared
+COARSE = {
+    "alignment": {"LEAST_ALIGNED_POINTS": 5000, "POINTS_PER_PHOTO": 0, "ALIGNMENT_WIDTHS": (512, 1024)},
+    "passersby": {"VOTE_WIDTH": 128},
+}
+# localize.py with these values
+COARSELY = f"""
+import sys
+from piccolo.cli.localize import main
+from piccolo.coloring import alignment, passersby
+vars(alignment).update({COARSE["alignment"]})
+vars(passersby).update({COARSE["passersby"]})
+sys.exit(main(sys.argv[1:]))
+"""
+
 WORK = (  # of the main commands, in a folder beside that of a room
     "prepare_map --cloud ../room/cloud.ply --out a.map",
     "localize --cloud a.map --pano ../room/images/clean_0.jpg --out poses.jsonl",

@@ -7,10 +7,11 @@ import threading
 import pytest
 import rooms
 import tiers
+from batches import COARSE
 from consistency import contradictions_of_line, find_contradictions, lines_of_results
 
 from piccolo.cloud.readers import e57, las, mesh, reader, text
-from piccolo.coloring import alignment
+from piccolo.coloring import alignment, passersby
 from piccolo.files import cache
 from piccolo.jobs.memory import limit_memory
 from piccolo.judge.result import Result
@@ -139,11 +140,11 @@ def limiting():
 
 @pytest.fixture(scope="module")
 def coarse_colors():
-    """Photos that colour a scan are aligned by fewer points and pixels, which is enough for a room."""
+    """Photos that colour a scan are compared by fewer points and pixels, which is enough for a room."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(alignment, "LEAST_ALIGNED_POINTS", 5000)
-        patch.setattr(alignment, "POINTS_PER_PHOTO", 0)
-        patch.setattr(alignment, "ALIGNMENT_WIDTHS", (512, 1024))
+        for module in (alignment, passersby):
+            for name, value in COARSE[module.__name__.rpartition(".")[2]].items():
+                patch.setattr(module, name, value)
         yield
 
 

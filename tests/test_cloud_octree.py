@@ -1,5 +1,6 @@
 """Voxels and octrees of clouds."""
 
+import functools
 import itertools
 
 import naive
@@ -22,7 +23,7 @@ CORNER = -voxel_table.PHASE / voxel_table.QUANTA_PER_METRE
 @pytest.mark.parametrize("turn", [LEVEL, TURN])
 @pytest.mark.parametrize("size", [0.3, 300.0])  # many points a voxel, or one, so that the table grows
 def test_voxels_equal_their_twin(size, turn):
-    raw = seeded_cloud(1, 60_000 if size > 1 else 20_000, size=(size, 0.9 * size, 0.8 * size))
+    raw = seeded_cloud(1, 40_000 if size > 1 else 20_000, size=(size, 0.9 * size, 0.8 * size))
     found = stream(raw, chunk=7001).voxels(turn)
     expected = naive.voxels(raw.points_world @ turn.T, raw.colors, voxel_table.LEAF_SIZE, CORNER)
     assert len(found.nodes) == len(expected)
@@ -126,21 +127,35 @@ def _cloud(count=5000, seed=0):
     return points, rng.integers(0, 256, (count, 3), dtype=np.uint8)
 
 
-def _octree(points, colors):
+def _build(points, colors):
     return build_octree(rooms.voxels(points, colors))
+
+
+@functools.lru_cache
+def _octree():
+    """The octree of the cloud, only to be read."""
+    return _build(*_cloud())
+
+
+@functools.lru_cache
+def _octree_with_a_wall():
+    """The same of a wall beside the cloud, all of one colour."""
+    rng = np.random.default_rng(1)
+    wall = np.stack([rng.uniform(-9, 9, 60_000), np.full(60_000, 3.0), rng.uniform(0, 4, 60_000)], axis=1)
+    points = np.concatenate([wall.astype(np.float32), _cloud()[0]])
+    return _build(points, np.full((len(points), 3), 90, np.uint8))
 
 
 def test_leaves_are_the_voxels_and_parents_the_means_of_their_children():
     voxels = rooms.voxels(*_cloud())
-    np.testing.assert_array_equal(build_octree(voxels).level(voxel_table.LEAF_SIZE), voxels.nodes)
-    octree = _octree(*_cloud())
+    octree = build_octree(voxels)
+    np.testing.assert_array_equal(octree.level(voxel_table.LEAF_SIZE), voxels.nodes)
     for level in range(voxel_table.NUM_LEVELS - 1):
         lo, hi = octree.level_start[level : level + 2]
         for node in (lo, (lo + hi) // 2, hi - 1):
             children = octree.nodes[octree.first_child[node] : octree.first_child[node + 1]]
             assert 1 <= len(children) <= 8
             np.testing.assert_allclose(octree.nodes[node], children.mean(axis=0), rtol=1e-5, atol=1e-5)
-    octree = _octree(*_cloud())
     last = octree.level_start[-2]
     assert octree.first_child[0] == octree.level_start[1]
     assert (np.diff(octree.first_child[: last + 1]) >= 1).all()
@@ -150,16 +165,16 @@ def test_leaves_are_the_voxels_and_parents_the_means_of_their_children():
 @pytest.mark.parametrize("num", [1, 7, 1000])
 def test_voxels_and_their_means_are_the_same_in_parts(monkeypatch, num):
     points, colors = _cloud(3000)
-    whole = _octree(points, colors)
+    whole = _build(points, colors)
     for module in (octree_module, voxel_table):
         monkeypatch.setattr(module, "VOXELS_AT_ONCE", num)
-    for values, others in zip(_octree(points, colors), whole, strict=True):
+    for values, others in zip(_build(points, colors), whole, strict=True):
         np.testing.assert_array_equal(values, others)
 
 
 @pytest.mark.parametrize(("size", "level"), [(0.02, 7), (0.04, 6), (0.16, 4), (100.0, 0), (0.001, 7)])
 def test_level_is_the_nearest_in_size(size, level):
-    octree = _octree(*_cloud())
+    octree = _octree()
     begin, end = octree.level_start[level : level + 2]
     np.testing.assert_array_equal(octree.level(size), octree.nodes[begin:end])
 
@@ -183,10 +198,7 @@ def _drawn(octree, center, voxel_per_range):
 @pytest.mark.parametrize("voxel_per_range", [1 / 4, 1 / 15, 1 / 30, 1 / 80, 1 / 300])
 @pytest.mark.parametrize("center", [[0.0, 0.0, 0.0], [4.0, -1.0, 0.5], [60.0, 0.0, 0.0]])
 def test_collects_the_coarsest_nodes_that_are_small_from_where_one_is(voxel_per_range, center):
-    rng = np.random.default_rng(1)
-    wall = np.stack([rng.uniform(-9, 9, 60_000), np.full(60_000, 3.0), rng.uniform(0, 4, 60_000)], axis=1)
-    points = np.concatenate([wall.astype(np.float32), _cloud()[0]])
-    octree = _octree(points, np.full((len(points), 3), 90, np.uint8))
+    octree = _octree_with_a_wall()
     found, directions = np.empty(MAX_NODES, np.int32), np.empty((3, MAX_NODES), np.float32)
     count = collect(octree, np.array(center), voxel_per_range, EVERYWHERE, found, directions)
     assert sorted(found[:count].tolist()) == _drawn(octree, np.float32(center), voxel_per_range)
@@ -197,7 +209,7 @@ def test_collects_the_coarsest_nodes_that_are_small_from_where_one_is(voxel_per_
 @pytest.mark.parametrize("half_angle", [10.0, 45.0, 100.0, 175.0])
 @pytest.mark.parametrize("voxel_per_range", [1 / 15, 1 / 80])
 def test_of_nodes_in_a_cone_none_is_left_out_and_their_order_stays(voxel_per_range, half_angle):
-    octree = _octree(*_cloud())
+    octree = _octree()
     center = np.array([0.3, -0.2, 0.1])
     found, directions = np.empty(MAX_NODES, np.int32), np.empty((3, MAX_NODES), np.float32)
     every = found[: collect(octree, center, voxel_per_range, EVERYWHERE, found, directions)].copy()
@@ -215,7 +227,7 @@ def test_of_nodes_in_a_cone_none_is_left_out_and_their_order_stays(voxel_per_ran
 
 
 def test_without_leaves_their_parents_are_the_leaves():
-    whole = _octree(*_cloud())
+    whole = _octree()
     thin = whole.without_leaves()
     assert thin.leaf_size == 2.0 * whole.leaf_size
     for k in range(1, voxel_table.NUM_LEVELS):
@@ -228,7 +240,7 @@ def test_without_leaves_their_parents_are_the_leaves():
 
 
 def test_collects_no_more_than_there_is_room_for():
-    octree = _octree(*_cloud())
+    octree = _octree()
     found = np.full(110, -1, np.int32)
     directions = np.zeros((3, 100), np.float32)
     assert collect(octree, np.zeros(3), 1 / 300, EVERYWHERE, found[:100], directions) == 100

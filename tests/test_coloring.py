@@ -165,7 +165,7 @@ def _gray_map(cloud):
 @functools.lru_cache
 def _two_alike():
     """A map of a room and its copy 20 m away."""
-    cloud = rooms.room(SEED)[1]
+    cloud = rooms.room(SEED, 20_000)[1]
     apart = cloud.points + np.float32([20.0, 0.0, 0.0])
     points = np.concatenate([cloud.points, apart])
     return _gray_map(replace(cloud, points=points, colors=np.tile(cloud.colors, (2, 1))))
@@ -202,7 +202,7 @@ def test_a_photo_sees_the_paint_of_others_alone(tmp_path, monkeypatch):
 
 def test_a_stranger_is_not_localized_by_its_own_paint(tmp_path, monkeypatch):
     monkeypatch.setattr(color_scan, "NUM_COLORING_ROUNDS", 1)
-    scan_map = _gray_map(rooms.room(SEED, 80_000)[1])
+    scan_map = _gray_map(rooms.room(SEED, 40_000)[1])
     settings = rooms.KNOWN
     right = [rooms.query(SEED, index=k, width=WIDTH) for k in range(2)]
     there = step(right[0].pose, np.array([0.0, 0.0, 0.7, 0.9, 0.5, 0.0]))

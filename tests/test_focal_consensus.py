@@ -1,31 +1,22 @@
-"""What the photos of one camera say of its focal length together, and what a batch makes of it."""
+"""What the photos of one camera say of its focal length together; test_three_doors.py has a whole batch."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import rooms
-from camera_room import DENSE, SEED, TRUE, place
-from pictures import encoded, write
 from poses import judged
 
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
-from piccolo.cli.localize import main
-from piccolo.geometry.pose import Pose, yaw_rotation
-from piccolo.jobs.threads import Workers
+from piccolo.geometry.pose import Pose
 from piccolo.judge.belief import make_belief
 from piccolo.judge.conclude import follow_consensus
 from piccolo.judge.consensus import WRONG_SHARE, Consensus, Opinion
 from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result
 from piccolo.judge.result_parts import FocalLength, Source
-from piccolo.result_files import read_results
 from piccolo.together.second_looks import follow_cameras, list_looks_by_focal
-from research.synthetic.world import render_picture
-
-TIER = "scene"
 
 GIVEN = 700.0
 
@@ -146,29 +137,3 @@ def test_a_photo_is_looked_at_again_with_the_focal_length_of_the_others():
     assert look.focal.picture_px == pytest.approx(1.2 * GIVEN)
     done = replace(weak, focal_length=look.focal)
     assert list_looks_by_focal([*sure, done]) == []
-
-
-def test_a_batch_finds_the_focal_length_of_its_camera(tmp_path):
-    """The whole thing by the command line, with a focal length that is 3 % too long."""
-    room, pose = place(1)
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    poses = []
-    for k in range(6):
-        turned = yaw_rotation(0.25 * k) @ pose.R_cam_from_world
-        poses.append(Pose(turned, pose.center_world + np.array([0.02 * k, 0.03, 0.0])))
-        picture = render_picture(Mount(pinhole(320, 240, TRUE)), room, poses[k], Workers(2))
-        write(photos / f"{k}.png", encoded(picture, ".png"))
-    words = ["--cloud", str(rooms.map_path(SEED, DENSE)), "--pano", str(photos), "--focal", str(1.03 * TRUE)]
-    out = tmp_path / "poses.jsonl"
-    main([*words, "--gravity", "known", "--quiet", "--threads", "2", "--out", str(out)])
-    results = read_results([out])
-    fitted = [r.focal_length for r in results if r.focal_length]
-    told = [focal.others_px for focal in fitted if focal.others_px]
-    assert told
-    assert told == pytest.approx([TRUE] * len(told), rel=0.01)
-    for result, true in zip(results, poses, strict=True):
-        if result.status == "localized":
-            assert result.pose.distance(true) < 0.05
-    main([*words, "--gravity", "known", "--quiet", "--threads", "2", "--out", str(out)])
-    assert read_results([out]) == results

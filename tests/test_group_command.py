@@ -28,15 +28,12 @@ FOCAL = 0.5 * SIZE[0] / math.tan(math.radians(37.5))
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Photos that overlap, one of them mirrored under another name, and a file that is no photo."""
+    """Photos that overlap."""
     made = tmp_path_factory.mktemp("a phone")
     camera = Mount(pinhole(*SIZE, FOCAL))
     for k, (_, pose) in enumerate(taken_photos()):
         picture = render_picture(camera, rooms.room(SEED)[0].rooms[0], pose, rooms.WORKERS)
         write(made / f"{k}.png", encoded(picture, ".png"))
-        if k == 0:
-            write(made / "mirrored.png", encoded(np.ascontiguousarray(picture[:, ::-1]), ".png"))
-    (made / "broken.png").write_bytes(b"no photo")
     return made
 
 
@@ -62,38 +59,41 @@ def _command(folder, *options):
     return list(map(str, words))
 
 
-@pytest.mark.process
-def test_photos_of_a_folder_are_localized_together_and_named(folder, tmp_path, capsys):
-    out = tmp_path / "poses.jsonl"
-    trace = tmp_path / "trace.jsonl"
-    assert main(_command(folder, "--together", "--out", out, "--trace", trace)) != 0, "one can't be read"
-    by_name = {result.pano.rpartition("/")[2]: result for result in read_results([out])}
-    assert list(by_name) == ["0.png", "1.png", "2.png", "broken.png", "mirrored.png"]
-    assert [by_name[f"{k}.png"].status for k in range(3)] == ["localized"] * 3
-    assert by_name["broken.png"].status == "unreadable"
-    assert by_name["mirrored.png"].status == "not_localized"
-    for k in range(3):
-        others = by_name[f"{k}.png"].beside.photos
-        assert [name.rpartition("/")[2] for name in others] == [f"{n}.png" for n in range(3) if n != k]
-        assert by_name[f"{k}.png"].settings["together"]
-    assert by_name["mirrored.png"].beside is None
-    said = capsys.readouterr().err
-    assert "5 photos together in" in said
-    assert "3 of them by others too" in said
-    steps = [json.loads(line) for line in trace.read_text().splitlines()]
-    assert {step["pano"].rpartition("/")[2] for step in steps} == {"0.png", "1.png", "2.png", "mirrored.png"}
-
-    lines = [untimed_line(result.to_json()) for result in by_name.values()]
-    pictures = {name: (folder / name).read_bytes() for name in by_name}
-    near = {"near": NEAR[:3], "radius": NEAR[3]}
-    asked = {"photo": {"focal_px": FOCAL}, "prior": near, "gravity": "known", "together": True}
+@pytest.fixture(scope="module")
+def client():
     with serving("--cloud", rooms.map_path(SEED), "--jobs", "1") as client:
-        status, _, body = client.post_all("/localize", pictures, asked)
-        assert client.post_all("/localize", pictures, asked | {"together": "yes"})[0] == 400
+        yield client
+
+
+@pytest.fixture(scope="module")
+def panoramas(tmp_path_factory):
+    """Two panoramas, which cost little, and between them a file that is no photo."""
+    made = tmp_path_factory.mktemp("panoramas")
+    offsets = {k: np.array([0.2 * k, 0.1, 0.0]) for k in range(2)}
+    for k, (panorama, _) in enumerate(rooms.take_photos(SEED, 360.0, offsets)):
+        write(made / f"{2 * k}.png", encoded(panorama.rgb, ".png"))
+    (made / "1.png").write_bytes(b"no photo")
+    return made
+
+
+@pytest.mark.process
+def test_the_service_localizes_photos_together_as_the_command_does(client, panoramas, tmp_path):
+    out = tmp_path / "poses.jsonl"
+    words = ["--cloud", str(rooms.map_path(SEED)), "--gravity", "known", "--mask-nadir", "20", "--quiet"]
+    given = ["--near", *map(str, NEAR), "--pano", str(panoramas), "--together"]
+    assert main([*words, *given, "--out", str(out)]) != 0, "one can't be read"
+    lines = list(map(untimed_line, out.read_text().splitlines()))
+    assert [line["status"] for line in lines] == ["localized", "unreadable", "localized"]
+    assert all(line["settings"]["together"] for line in lines[::2])
+    pictures = {path.name: path.read_bytes() for path in sorted(panoramas.iterdir())}
+    near = {"near": NEAR[:3], "radius": NEAR[3]}
+    asked = {"photo": {"mask_nadir_deg": 20}, "prior": near, "gravity": "known", "together": True}
+    status, _, body = client.post_all("/localize", pictures, asked)
+    assert client.post_all("/localize", pictures, asked | {"together": "yes"})[0] == 400
     assert status == 200
     for answer, line in zip(map(untimed_line, body.decode().splitlines()), lines, strict=True):
         assert answer["pano"] == line["pano"].rpartition("/")[2]
-        assert answer["error"] == (line["error"] and line["error"].replace(f"{folder}/", ""))
+        assert answer["error"] == (line["error"] and line["error"].replace(f"{panoramas}/", ""))
         assert (answer["beside"] is None) == (line["beside"] is None)
         own = {"pano", "error", "beside"}
         assert {k: v for k, v in answer.items() if k not in own} == {
@@ -102,7 +102,7 @@ def test_photos_of_a_folder_are_localized_together_and_named(folder, tmp_path, c
 
 
 @pytest.mark.process
-def test_a_batch_looks_at_photos_that_are_not_sure_together(folder, tmp_path, capsys):
+def test_a_batch_looks_at_photos_that_are_not_sure_together(folder, client, tmp_path, capsys):
     """One of three is localized alone; the service says the same, and a second run has nothing to do."""
     out = tmp_path / "poses.jsonl"
     names = [folder / f"{name}.png" for name in range(3)]
@@ -123,10 +123,9 @@ def test_a_batch_looks_at_photos_that_are_not_sure_together(folder, tmp_path, ca
     assert "nothing is left to do" in capsys.readouterr().err
     assert out.read_bytes() == before
     pictures = {name.name: name.read_bytes() for name in names}
-    with serving("--cloud", rooms.map_path(SEED), "--jobs", "1") as client:
-        near = {"near": NEAR[:3], "radius": NEAR[3]}
-        asked = {"photo": {"focal_px": FOCAL}, "prior": near, "gravity": "known"}
-        _, _, body = client.post_all("/localize", pictures, asked)
+    near = {"near": NEAR[:3], "radius": NEAR[3]}
+    asked = {"photo": {"focal_px": FOCAL}, "prior": near, "gravity": "known"}
+    _, _, body = client.post_all("/localize", pictures, asked)
     for answer, line in zip(map(untimed_line, body.decode().splitlines()), lines, strict=True):
         assert answer | {"pano": line["pano"], "beside": line["beside"]} == line
         assert (answer["beside"] or {}).get("is_together") == (line["beside"] or {}).get("is_together")
@@ -135,20 +134,27 @@ def test_a_batch_looks_at_photos_that_are_not_sure_together(folder, tmp_path, ca
 def test_a_film_of_one_place_is_its_frames_together(folder, tmp_path, capsys):
     """A camera shows each of three views for half a second."""
     film = tmp_path / "film.mp4"
+    out = tmp_path / "poses.jsonl"
+    trace = tmp_path / "trace.jsonl"
     with writing_video(film, 2.0, SIZE) as add:
         for k in range(3):
             add(cv2.imread(str(folder / f"{k}.png"))[..., ::-1])
-    words = _command(folder, "--together", "--overwrite", "--out", tmp_path / "poses.jsonl")
+    words = _command(folder, "--together", "--overwrite", "--out", out)
     begin = words.index("--pano")
     words[begin : begin + 2] = ["--video", str(film)]
-    main(words)
-    results = read_results([tmp_path / "poses.jsonl"])
-    assert [one.pano for one in results] == [f"{film}#t={time}" for time in ("0.000", "0.500", "1.000")]
-    assert [one.status for one in results].count("localized") >= 2
-    named = {name for one in results if one.beside for name in one.beside.photos}
-    assert named
-    assert named <= {one.pano for one in results}
-    assert "3 photos together in" in capsys.readouterr().err
+    main([*words, "--trace", str(trace)])
+    results = read_results([out])
+    frames = [f"{film}#t={time}" for time in ("0.000", "0.500", "1.000")]
+    assert [one.pano for one in results] == frames
+    assert [one.status for one in results] == ["localized"] * 3
+    for one in results:
+        assert list(one.beside.photos) == [name for name in frames if name != one.pano]
+        assert one.settings["together"]
+    steps = [json.loads(line) for line in trace.read_text().splitlines()]
+    assert {step["pano"] for step in steps} == set(frames)
+    said = capsys.readouterr().err
+    assert "3 photos together in" in said
+    assert "3 of them by others too" in said
     assert main([*words, "--max-speed", "2"]) == 2
     assert "--max-speed: not with --together: its photos are in no order" in capsys.readouterr().err
 

@@ -1,11 +1,13 @@
 """Jobs that are killed at any moment and begun again leave the files of one that was not."""
 
 import signal
+import subprocess
+import sys
 import time
 
 import pytest
 import rooms
-from batches import start_localize, untimed
+from batches import COARSELY, ROOT, untimed
 from pictures import encoded, write
 from poses import result
 
@@ -49,6 +51,7 @@ def _wait_for_step(process, out, num_lines):
 @pytest.mark.parametrize(
     ("kind", "num_lines"), [("photos", 1), ("walk", 2), ("relative", 0), ("together", 0), ("color", 4)]
 )
+@pytest.mark.usefixtures("coarse_colors")
 def test_a_job_that_is_killed_goes_on(scene, tmp_path, kind, num_lines):
     folder, words = scene
 
@@ -66,7 +69,7 @@ def test_a_job_that_is_killed_goes_on(scene, tmp_path, kind, num_lines):
     whole, expected, colored = words_of("whole")
     code = main(whole)
     again, out, colored_again = words_of("killed")
-    process = start_localize(again)
+    process = subprocess.Popen([sys.executable, "-c", COARSELY, *again], cwd=ROOT, stderr=subprocess.PIPE)
     _wait_for_step(process, out, num_lines)
     process.send_signal(signal.SIGKILL)
     process.communicate()

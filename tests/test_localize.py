@@ -239,10 +239,18 @@ def test_closed_pipe_is_no_error_message(scene):
 
 @pytest.mark.process
 def test_first_use_is_announced_and_two_processes_may_share_it(scene, tmp_path):
-    """The first one waits, where it begins to compile, until the second has come as far."""
+    """The first one waits, where it begins to compile, until the second has come as far.
+
+    Each has one core, so that no helper compiles what neither needs.
+    """
     options = {"env": {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}, "stdout": subprocess.PIPE}
     arguments = _arguments(scene, *PAPER)
-    first, second = (start_localize(arguments, **options) for _ in range(2))
+    cores = sorted(os.sched_getaffinity(0))
+
+    def start(core):
+        return start_localize(arguments, **options, preexec_fn=lambda: os.sched_setaffinity(0, {core}))
+
+    first, second = map(start, (cores[0], cores[-1]))
     try:
         assert any("compiling kernels (only once)" in line for line in first.stderr)
         first.send_signal(signal.SIGSTOP)

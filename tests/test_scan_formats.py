@@ -32,8 +32,8 @@ SETUPS = (
 
 @pytest.fixture(scope="module")
 def raw(scene):
-    """Half of the points of the scene."""
-    vertices = PlyData.read(scene / "cloud.ply")["vertex"].data[::2]
+    """A quarter of the points of the scene."""
+    vertices = PlyData.read(scene / "cloud.ply")["vertex"].data[::4]
     points = np.stack([vertices[name] for name in "xyz"], axis=1).astype(np.float64)
     return RawCloud(points, np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1))
 

@@ -377,7 +377,7 @@ def test_a_scan_that_is_replaced_is_opened_again(folder, scene, photo):
             os.kill(worker, signal.SIGKILL)
         assert json.loads(client.post("/localize", "a.jpg", photo)[2])["status"] == "localized"
         assert json.loads(client.ask("GET", "/scan")[2])["scanSha256"] == before["cloud_sha256"]
-        rooms.write_cloud(path, 3)
+        rooms.write_cloud(path, 3, 20_000)
         deadline = time.monotonic() + 60.0
         with ThreadPoolExecutor(2) as pool:
             while json.loads(client.ask("GET", "/scan")[2])["scanSha256"] == before["cloud_sha256"]:

@@ -17,18 +17,18 @@ SHOP = "https://shop.example"
 
 
 @contextmanager
-def _behind_proxy(scene, folder):
+def _behind_proxy(scene):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     words = ["--jobs", "1", "--public-url", PUBLIC, "--allow-origin", SHOP, "--port", port]
-    with serving("--cloud", scene / "cloud.ply", "--cache", folder, *words) as client:
+    with serving("--cloud", scene / "cloud.ply", "--cache", scene.parent / "maps", *words) as client:
         client.token = client.address.removeprefix(f"{PUBLIC}enter?token=")
         yield client
 
 
-def test_others_need_the_token(scene, tmp_path):
+def test_others_need_the_token(scene):
     words = ["--host", "0.0.0.0", "--jobs", "1"]
-    with serving("--cloud", scene / "cloud.ply", "--cache", tmp_path, *words) as client:
+    with serving("--cloud", scene / "cloud.ply", "--cache", scene.parent / "maps", *words) as client:
         token = client.address.split("token=")[1]
         for path in ("/", "/scan", "/report.js", "/app.js"):
             status, headers, _ = client.ask("GET", path)
@@ -44,9 +44,9 @@ def test_others_need_the_token(scene, tmp_path):
         assert client.ask("GET", "/health")[0] == 200
 
 
-def test_a_page_behind_a_proxy_and_pages_of_another_site(scene, tmp_path):
+def test_a_page_behind_a_proxy_and_pages_of_another_site(scene):
     photo = (scene / "images" / "clean_0.jpg").read_bytes()
-    with _behind_proxy(scene, tmp_path) as client:
+    with _behind_proxy(scene) as client:
         for prefix in ("", "/flat"):  # which a proxy leaves out, or in
             status, headers, _ = client.ask(
                 "GET", f"{prefix}/enter?token={client.token}", Host="scans.example"
@@ -71,8 +71,8 @@ def test_a_page_behind_a_proxy_and_pages_of_another_site(scene, tmp_path):
         assert client.ask("OPTIONS", "/localize", Origin="https://evil.example", **told)[0] == 400
 
 
-def test_a_refusal_says_what_a_proxy_needs(scene, tmp_path):
-    with serving("--cloud", scene / "cloud.ply", "--cache", tmp_path, "--jobs", "1") as client:
+def test_a_refusal_says_what_a_proxy_needs(scene):
+    with serving("--cloud", scene / "cloud.ply", "--cache", scene.parent / "maps", "--jobs", "1") as client:
         for asked in ({"Host": "scans.example"}, {"Origin": "https://scans.example"}):
             status, _, body = client.post("/localize", "a.jpg", b"", **asked)
             assert (status, "`public_url`" in json.loads(body)["error"]) == (403, True)

@@ -43,8 +43,17 @@ def photo(scene):
     return (scene / "images" / "clean_0.jpg").read_bytes()
 
 
-def test_silent_connections_and_unfinished_uploads_keep_nobody_out(scene, tmp_path, photo):
-    words = ["--cloud", scene / "cloud.ply", "--cache", tmp_path, "--jobs", "1", "--max-waiting", "2"]
+def test_silent_connections_and_unfinished_uploads_keep_nobody_out(scene, photo):
+    words = [
+        "--cloud",
+        scene / "cloud.ply",
+        "--cache",
+        scene.parent / "maps",
+        "--jobs",
+        "1",
+        "--max-waiting",
+        "2",
+    ]
     few = ["sh", "-c", 'ulimit -n 130; exec "$@"', "sh"]
     unfinished = FORM + b"Content-Length: 9000000\r\n\r\n" + PART + bytes(1_500_000)
     with serving(*words, before=few) as client:
@@ -55,8 +64,8 @@ def test_silent_connections_and_unfinished_uploads_keep_nobody_out(scene, tmp_pa
 
 
 def test_who_leaves_is_not_computed(scene, tmp_path, photo):
-    words = ["--cloud", scene / "cloud.ply", "--cache", tmp_path / "maps", "--jobs", "1", "--keep", tmp_path]
-    with serving(*words) as client:
+    words = ["--cloud", scene / "cloud.ply", "--cache", scene.parent / "maps", "--jobs", "1"]
+    with serving(*words, "--keep", tmp_path) as client:
         with _connected(client.port, 12, _request(photo)):
             while json.loads(client.ask("GET", "/health")[2])["waiting"] < 6:
                 time.sleep(0.01)
@@ -136,8 +145,8 @@ def test_who_does_not_read_is_ended(monkeypatch):
     assert _run(monkeypatch, talk) < 20_000_000
 
 
-def test_a_kept_connection_is_answered_at_once(scene, tmp_path):
-    with serving("--cloud", scene / "cloud.ply", "--cache", tmp_path, "--jobs", "1") as client:
+def test_a_kept_connection_is_answered_at_once(scene):
+    with serving("--cloud", scene / "cloud.ply", "--cache", scene.parent / "maps", "--jobs", "1") as client:
         connection = http.client.HTTPConnection("127.0.0.1", client.port)
         seconds = []
         for _ in range(9):

@@ -30,7 +30,7 @@ def keep(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def service(scene, keep, photo):
-    words = ["--cache", keep.parent / "maps", "--jobs", "1", "--keep", keep]
+    words = ["--cache", scene.parent / "maps", "--jobs", "1", "--keep", keep]
     with serving("--cloud", scene / "cloud.ply", *words) as client:
         _assert_works(client, keep, photo)  # a process keeps the limits that it begins with
         yield client
