@@ -241,6 +241,17 @@ def test_bounds_are_checked_where_code_without_is_kept(home_cache, monkeypatch):
     assert len(list((home_cache / "kernels").glob("*.kernel"))) == 2
 
 
+def test_a_kernel_outside_the_package_is_compiled_again_where_its_source_has_changed(tmp_path, home_cache):
+    """Compiled code of the one before was used: kernels of research/ did what they no longer said."""
+    source = tmp_path / "outside.py"
+    for added in (1.0, 2.0):
+        source.write_text(f"ADDED = {added}\ndef add(x):\n    return x + ADDED\n")
+        jit.own_digest.cache_clear()
+        made = {}
+        exec(compile(source.read_text(), str(source), "exec"), made)
+        assert kernel(made["add"])(np.float64(3.0)) == 3.0 + added
+
+
 def test_losses_of_one_making_are_kept_apart_on_disk():
     """Compiled code is looked up by the names of all that is compiled in."""
     names = {adder._cache.name for adder in (add_channels, add_packed)}

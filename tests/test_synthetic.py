@@ -27,7 +27,7 @@ from research.scene import read_scene
 from research.synthetic import make_room as tool
 from research.synthetic.layout import make_room
 from research.synthetic.office import make_office
-from research.synthetic.raycast import cast_rays
+from research.synthetic.raycast import cast_rays, hit_boxes
 from research.synthetic.walk_frames import BAD_KINDS, WalkOptions, frames_of
 from research.synthetic.walking import HEIGHT, Walker
 from research.synthetic.world import (
@@ -156,6 +156,27 @@ def test_rays_meet_what_is_nearest_among_hundreds_of_boxes():
             assert (labels > 0).all()
             assert ((rgb >= 0) & (rgb <= 1)).all()
             assert (rgb.max(axis=1) > 0.02).mean() > 0.99
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("offset", [0.0, 0.5, -0.5, 0.499, 0.501, 3.0])
+def test_rays_with_zero_components_meet_a_box_if_they_start_level_with_it(axis, offset):
+    """One that runs along a face may meet it or not; see NO_ZERO."""
+    rays = np.array([np.eye(3)[axis], -np.eye(3)[axis]])
+    for beside in {0, 1, 2} - {axis}:
+        origin = np.zeros(3)
+        origin[axis] = -4.0
+        origin[beside] = offset
+        box = np.array([[0.0, 0.0, 0.0, 0.5, 0.5, 0.5, 0.0]])
+        ranges = np.empty(2)
+        hits = np.empty(2, np.int64)
+        hit_boxes(origin, rays, box, ranges, hits)
+        assert ranges[1] == np.inf
+        assert hits[1] == -1
+        if abs(offset) != 0.5:
+            is_hit = abs(offset) < 0.5
+            assert ranges[0] == (pytest.approx(3.5) if is_hit else np.inf)
+            assert hits[0] == (axis if is_hit else -1)
 
 
 def test_copies_are_exact_and_others_are_not():

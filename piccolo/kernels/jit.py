@@ -92,6 +92,13 @@ def sources_digest() -> str:
     return digest.hexdigest()
 
 
+@cache
+def own_digest(source: str) -> str:
+    """Return a digest of a kernel's own source, which may lie outside this package; none of typed-in code."""
+    path = Path(source)
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+
+
 @dataclass
 class Compiling:
     """The kernels that this process has compiled, reported as the log's INFO."""
@@ -185,6 +192,7 @@ class KernelCache:
     def __init__(self, function: Any) -> None:
         """Remember which kernel; nothing is opened."""
         self.name = " ".join(f"{f.__module__}.{f.__qualname__}" for f in (function, *find_captured(function)))
+        self.source: str = function.__code__.co_filename
         self.cache_path = None  # Numba's `stats` shows it
         self.claims: dict[Path, ExitStack] = {}  # files that this process is to write
 
@@ -192,7 +200,7 @@ class KernelCache:
         """Return the file for a signature on this machine's processor."""
         versions = numba.__version__, np.__version__, sys.version_info[:2], sys.byteorder
         how = versions, codegen.magic_tuple(), [getattr(numba.config, flag, None) for flag in FLAGS]
-        key = repr((self.name, str(signature), how, sources_digest()))
+        key = repr((self.name, str(signature), how, sources_digest(), own_digest(self.source)))
         folder = kernel_folder()
         return folder and folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.kernel"
 

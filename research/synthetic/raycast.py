@@ -16,6 +16,9 @@ LAMP_DECAY = 0.15  # [1/m2]
 CHUNK = 4_096  # rays
 NUM_FIRST = 32  # boxes
 MARGIN = 1e-6  # of a cone around rays [rad], and of a range [m]
+# added to components of directions, of which it changes only zeros: their inverse stays finite, as infinity
+# less infinity is NaN, and so does its product with lengths in metres
+NO_ZERO = 1e-200
 
 Integer = int | np.int64  # in a kernel
 
@@ -98,10 +101,9 @@ def hit_boxes(origin: Array, directions: Array, boxes: Array, ranges: Array, hit
             dx = directions[n, 0]
             dy = directions[n, 1]
             dz = directions[n, 2]
-            # A ray along a face divides by zero on purpose: infinities compare as they should.
-            ix = 1.0 / (c * dx + s * dy)
-            iy = 1.0 / (c * dy - s * dx)
-            iz = 1.0 / dz
+            ix = 1.0 / (c * dx + s * dy + NO_ZERO)
+            iy = 1.0 / (c * dy - s * dx + NO_ZERO)
+            iz = 1.0 / (dz + NO_ZERO)
             hx = half_x * abs(ix)
             hy = half_y * abs(iy)
             hz = half_z * abs(iz)
