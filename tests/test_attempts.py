@@ -26,7 +26,7 @@ from piccolo.panorama import GPano, Panorama
 from piccolo.photo import Prior
 from piccolo.problem.method import METHOD
 from piccolo.problem.photo_images import MIRROR
-from piccolo.problem.problem import Features
+from piccolo.problem.problem import Features, prepare_problem
 from piccolo.problem.settings import CoarseToFineSettings, Effort
 from research.synthetic.world import mask_outside_field
 
@@ -173,18 +173,22 @@ def test_a_brief_search_keeps_what_little_a_prior_leaves():
 
 def _list_attempts(problem):
     planned = attempts.plan_attempts(problem)
-    return [(len(by.features), run.keywords if isinstance(run, partial) else run) for by, run in planned]
+    return [
+        (len(by.features), run.func, run.keywords) if isinstance(run, partial) else (len(by.features), run)
+        for by, run in planned
+    ]
 
 
 LOOK = (0, attempts.look_first)
 HALF = (1, attempts.search_part)
 ALL = (2, attempts.search_matches)
 DRAWN = (0, attempts.draw_found)
-FIRST_UPRIGHT = (0, {"tilts": "known"})
-FIRST_TILTED = (0, {"tilts": "any", "is_brief": True})
-UPRIGHT = (2, {"tilts": "known"})
-ABOUT_LEVEL = (2, {"tilts": "level"})
-TILTED = (2, {"tilts": "any", "is_brief": False})
+FIRST_UPRIGHT = (0, attempts.search_views, {"tilts": "known"})
+FIRST_TILTED = (0, attempts.search_views, {"tilts": "any", "is_brief": True})
+TILTED_LAST = (2, attempts.search_views, {"tilts": "any", "is_brief": False})
+TILTED = (0, attempts.search_views, {"tilts": "any", "is_brief": False})
+UPRIGHT = [(0, run, {"tilts": "known"}) for run in (attempts.search_briefly, attempts.search_views)]
+ABOUT_LEVEL = [(0, run, {"tilts": "level"}) for run in (attempts.search_briefly, attempts.search_views)]
 
 
 @pytest.mark.parametrize(
@@ -192,25 +196,39 @@ TILTED = (2, {"tilts": "any", "is_brief": False})
     [
         (WHOLE, False, "auto", [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, HALF, ALL]),
         (WHOLE, False, "known", [LOOK, DRAWN, FIRST_UPRIGHT, HALF, ALL]),
-        (WHOLE, False, "unknown", [HALF, ALL, TILTED]),
+        (WHOLE, False, "unknown", [HALF, ALL, TILTED_LAST]),
         (WHOLE, True, "auto", [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, HALF, ALL]),
-        (PARTIAL, False, "auto", [HALF, ALL, ABOUT_LEVEL, TILTED]),
-        (PARTIAL, False, "known", [HALF, ALL, ABOUT_LEVEL]),
-        (PARTIAL, False, "unknown", [HALF, ALL, ABOUT_LEVEL, TILTED]),
-        (PARTIAL, True, "auto", [HALF, ALL, UPRIGHT, TILTED]),
-        (PARTIAL, True, "known", [HALF, ALL, UPRIGHT]),
+        (PARTIAL, False, "auto", [*ABOUT_LEVEL, TILTED]),
+        (PARTIAL, False, "known", ABOUT_LEVEL),
+        (PARTIAL, False, "unknown", [*ABOUT_LEVEL, TILTED]),
+        (PARTIAL, True, "auto", [*UPRIGHT, TILTED]),
+        (PARTIAL, True, "known", UPRIGHT),
     ],
 )
 def test_attempts_are_made_in_this_order(profile, has_tilt, gravity, expected):
-    """Photos of a part of the sphere are searched about level, unless their tilt is known."""
+    """Photos of a part of the sphere are searched about level, unless their tilt is known, by views alone."""
+    features = PROBLEM.features if profile.matches_map else ()
     photo = SimpleNamespace(has_tilt=has_tilt)
-    assert _list_attempts(replace(PROBLEM, profile=profile, photo=photo, gravity=gravity)) == expected
+    asked = replace(PROBLEM, profile=profile, photo=photo, gravity=gravity, features=features)
+    assert _list_attempts(asked) == expected
 
 
-@pytest.mark.parametrize(("profile", "upright"), [(WHOLE, "known"), (PARTIAL, "level")])
-def test_without_features_of_the_map_whole_views_are_searched_alone(profile, upright):
-    problem = replace(PROBLEM, profile=profile, features=())
-    assert _list_attempts(problem) == [(0, {"tilts": upright}), (0, {"tilts": "any", "is_brief": False})]
+@pytest.mark.parametrize("how", ["whole", "part of a sphere", "without colours"])
+def test_only_whole_photos_are_matched_with_features_of_the_map(how):
+    """Those of a map of which none were made yet are not made for a photo of a part of the sphere."""
+    panorama = rooms.as_panorama(rooms.query(1).rgb)
+    if how == "part of a sphere":
+        is_valid = panorama.is_valid.copy()
+        is_valid[:, : is_valid.shape[1] // 3] = False
+        panorama = replace(panorama, is_valid=is_valid)
+    scan_map = replace(rooms.scan_map(1), has_shape=how == "without colours")
+    problem = prepare_problem(panorama, scan_map)
+    assert len(problem.features) == (2 if how == "whole" else 0)
+
+
+def test_without_features_of_the_map_whole_views_are_searched_alone():
+    problem = replace(PROBLEM, profile=WHOLE, features=())
+    assert _list_attempts(problem) == [FIRST_UPRIGHT, TILTED]
 
 
 @pytest.mark.parametrize(("sure", "num_made"), [(1, 1), (2, 2), (None, 3)])

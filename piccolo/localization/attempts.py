@@ -53,9 +53,9 @@ def plan_attempts(problem: Problem) -> list[tuple[Problem, Attempt]]:
     A first look by whole views, or the scan drawn at its poses, may settle a whole upright sphere, and a look
     along walls a photo of edges. Then come searches by whole views: with gravity `auto` as known, then as
     unknown (briefly, for a whole sphere). Poses from matches with features of the map, first of a part of the
-    photo's views, then of all, come last: those of the map may have to be made. Partial photos, and those of
-    any tilt, ask them first. Partial photos are mostly taken about level: with a tilt that is not known
-    exactly, "known" searches about level.
+    photo's views, then of all, come last: those of the map may have to be made. Whole photos of any tilt ask
+    them first, partial ones never: these are mostly taken about level, so with a tilt that is not known
+    exactly, "known" searches about level, first the few best starts.
     """
     looks_first = bool(problem.features) and can_look_first(problem)
     first: list[tuple[Problem, Attempt]] = []
@@ -73,6 +73,8 @@ def plan_attempts(problem: Problem) -> list[tuple[Problem, Attempt]]:
     profile = problem.profile
     if profile.is_always_upright or problem.gravity != "unknown":
         upright: Tilts = "known" if problem.photo.has_tilt else profile.untold_tilt
+        if profile.is_narrow:
+            by_views.append((asked, partial(search_briefly, tilts=upright)))
         by_views.append((asked, partial(search_views, tilts=upright)))
     if problem.gravity != "known":
         by_views.append((asked, partial(search_views, tilts="any", is_brief=looks_first)))
@@ -138,6 +140,14 @@ def refine_matched(
         return end_search(problem, found, workers)
 
 
+def search_briefly(
+    problem: Problem, known: list[Candidate], means: Means, tilts: Tilts
+) -> tuple[list[Candidate], bool]:
+    """Search by whole views and refine the few best starts; True if the result is sure."""
+    brief = means._replace(effort=means.effort.brief())
+    return add_found(problem, search_and_refine(problem, tilts, FIRST_BEAM, brief), known, means)
+
+
 def search_views(
     problem: Problem, known: list[Candidate], means: Means, tilts: Tilts, is_brief: bool = False
 ) -> tuple[list[Candidate], bool]:
@@ -147,6 +157,13 @@ def search_views(
         refined = search_and_refine(thin_out(problem), tilts, FIRST_BEAM, thin)
     else:
         refined = search_and_refine(problem, tilts, problem.profile.beam, means)
+    return add_found(problem, refined, known, means)
+
+
+def add_found(
+    problem: Problem, refined: list[Candidate], known: list[Candidate], means: Means
+) -> tuple[list[Candidate], bool]:
+    """Add poses from whole views, refined and verified; True if the best is sure."""
     with means.watch.stage("refine"):
         found = known + add_verified(problem, refined, means.workers)
         return end_search(problem, found, means.workers)

@@ -56,7 +56,7 @@ class Problem:
     profile: Profile
     prior: Prior
     gravity: Gravity
-    # of a part of the photo's views each, asked with workers; none by whole views alone
+    # of a part of the photo's views each, asked with workers; none if views alone propose poses
     features: tuple[Once[Features], ...]
     rotations: Array | None = None  # (N, 3, 3) camera from map, searched in place of all
     beside: tuple[Matches, ...] = ()  # with each of the photos beside this one whose poses are known
@@ -140,10 +140,11 @@ def prepare_problem(
     if scan_map.has_shape:
         panorama = draw_edges(panorama, R_cam_from_level, scan_map.has_intensity)
     photo = make_photo(panorama, choose_scales(scan_map.has_shape), R_cam_from_level, has_tilt)
+    profile = choose_profile(photo.small.valid_share, photo.is_partial, scan_map.has_shape, method)
     every = cover_sphere(photo.panorama.rgb.shape[1])
     features = tuple(
         Once(find_features, photo.panorama, scan_map, [every[k] for k in half])
-        for half in (() if scan_map.has_shape else HALVES)
+        for half in (HALVES if profile.matches_map else ())
     )
     return Problem(
         source=source,
@@ -152,7 +153,7 @@ def prepare_problem(
         colors=Once(make_texels, panorama),
         scan_map=scan_map,
         views=make_views(scan_map),
-        profile=choose_profile(photo.small.valid_share, photo.is_partial, scan_map.has_shape, method),
+        profile=profile,
         prior=prior,
         gravity=gravity,
         features=features,
