@@ -1,7 +1,6 @@
 """Reports in Debian's Chromium, opened from disk: what they need, and what all of them must never do."""
 
 import functools
-import os
 import shutil
 import sys
 from contextlib import contextmanager
@@ -99,10 +98,8 @@ def find_barriers():
 
 
 @pytest.fixture
-def shoot():
-    """A function that keeps a screenshot to look at, if the environment asks for SCREENSHOTS."""
-    if not os.environ.get("SCREENSHOTS"):
-        return lambda *_: None
+def shoot(request):
+    """A function that keeps a screenshot as an artifact of the test."""
     ARTIFACTS.mkdir(exist_ok=True)
     return lambda page, name: page.screenshot(path=ARTIFACTS / f"{name}.png")
 

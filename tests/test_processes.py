@@ -12,7 +12,7 @@ import pytest
 from batches import ROOT
 
 from piccolo.errors import InputError
-from piccolo.jobs.processes import IN_FLIGHT, Here, Processes, WorkerLostError
+from piccolo.jobs.processes import IN_FLIGHT, LIBRARIES, Here, Processes, WorkerLostError
 
 TIER = "process"
 
@@ -126,7 +126,8 @@ def check_threads_and_signals():
 
 def test_processes_leave_signals_to_their_parent_from_the_first_of_all_on():
     code = "import test_processes as t; t.check_threads_and_signals()"
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
+    own = {name: value for name, value in os.environ.items() if name not in LIBRARIES}
+    environment = {**own, "PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
     subprocess.run([sys.executable, "-c", code], env=environment, check=True)
 
 
