@@ -305,7 +305,8 @@ def expect(
 ) -> PoseGaussian | None:
     """Return the pose of a photo by its matches with others; None if too few agree.
 
-    Its errors are those of the matches, and of the poses of the photos that tell the most.
+    Its errors are those of the matches, and of the poses of the photos that tell the most; if few matches
+    agree, also those of local optima.
     """
     parts = links.match(number, located)
     if not parts:
@@ -318,6 +319,7 @@ def expect(
     sources = sorted(telling, key=lambda k: -telling[k])[:MOST_SOURCES]
     shares = np.array([telling[k] for k in sources]) / sum(telling[k] for k in sources)
     attached = [known[k].attach(found.pose @ known[k].pose.inverse(), UNCERTAIN) for k in sources]
-    own = sum((share**2 * one.own for share, one in zip(shares, attached, strict=True)), UNCERTAIN)
+    of_chance = LOCAL_ERRORS if sum(counts.values()) < FIRM.least else UNCERTAIN
+    own = sum((share**2 * one.own for share, one in zip(shares, attached, strict=True)), of_chance)
     common = sum((share * one.common for share, one in zip(shares, attached, strict=True)), UNCERTAIN)
     return PoseGaussian(found.pose, own + found.covariance, common)
