@@ -133,7 +133,7 @@ def test_a_certain_place_counts_whole_however_inexact_the_pose_is(std):
         best_pose=best.pose,
         alternatives=(Alternative(other.pose, other.score),),
         gaussian=gaussian,
-        std_of_fit=0.005,
+        std_of_fit=0.00125,
     )
     found = Found(problem, Selection(best, (other,)), None)
     member = bundle_search.PosedMember(found, alone, Pose(np.eye(3), np.zeros(3)))

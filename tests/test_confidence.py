@@ -17,7 +17,7 @@ from piccolo.judge.probability import Standing, classify, posterior
 from piccolo.paper.localize import PaperSettings
 from piccolo.problem.settings import CoarseToFineSettings
 
-SURE = 0.002  # [m] largest deviation
+SURE = 0.0005  # [rad] largest deviation
 RIGHT, WRONG = Standing(1.0, 0.8, 60, "drawn scan"), Standing(1.0, 0.03, 3, "drawn scan")
 ELSEWHERE = Standing(0.1, 0.05, 3, "drawn scan")
 MODEL = rule.ChoiceModel((3.0, 1.0, 2.0), (10.0, 2.0))
@@ -90,10 +90,10 @@ def test_a_pose_that_may_be_a_decimetre_off_is_doubtful_whatever_the_evidence(wi
     assert p.sum() == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(("a", "b"), [(1.0, 50.0), (0.003, 0.001)])
+@pytest.mark.parametrize(("a", "b"), [(0.25, 12.5), (0.00075, 0.00025)])
 def test_numbers_beyond_reason_change_nothing_more(a, b):
     np.testing.assert_array_equal(*(rule.none_features(std) for std in (a, b)))
-    assert (rule.none_features(None) == rule.none_features(0.3)).all()
+    assert (rule.none_features(None) == rule.none_features(0.075)).all()
     least, less = (Standing(*values, 0, "drawn scan") for values in ((0.0, 0.02), (-0.5, -0.3)))
     faint, nothing = (rule.pose_features(standing) for standing in (least, less))
     np.testing.assert_array_equal(faint, nothing)

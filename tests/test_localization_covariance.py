@@ -15,6 +15,7 @@ from piccolo.cloud.readers.reader import PointSource, RawCloud
 from piccolo.cloud.stream import CloudStream
 from piccolo.evidence import covariance
 from piccolo.evidence.examine import examine
+from piccolo.geometry.nearness import ROOM_RANGE
 from piccolo.geometry.pose import Pose, exp_so3, step, yaw_rotation
 from piccolo.geometry.sphere import compute_pixels, pixel_rays
 from piccolo.jobs.threads import Workers
@@ -229,6 +230,13 @@ def turn_half(rgb, azimuth, turn):
     return np.where(is_ahead[..., None], turned, rgb)
 
 
+def test_a_deviation_counts_as_an_angle_beyond_rooms():
+    error = np.diag([1e-6, 1e-6, 1e-6, 0.01, 0.04, 0.02]) ** 2
+    near, room, far = (covariance.compute_std_of_fit(error, k * ROOM_RANGE) for k in (0.5, 1.0, 4.0))
+    assert near == room == pytest.approx(0.04 / ROOM_RANGE)
+    assert far == pytest.approx(room / 4.0)
+
+
 @pytest.mark.parametrize(("seed", "azimuth", "turn"), [(1, 0.0, (0, 0, 0.03)), (3, 1.0, (0.02, 0, 0))])
 def test_a_half_that_is_turned_widens_the_covariance_until_it_covers_the_true_position(seed, azimuth, turn):
     taken = query(seed)
@@ -242,7 +250,8 @@ def test_a_half_that_is_turned_widens_the_covariance_until_it_covers_the_true_po
         assert found.status == "localized"
     assert max(errors) < 7.81
     assert stds[0].covariance.largest_std < 0.003  # [m]
-    assert stds[1].covariance.largest_std > 1.5 * max(stds[1].std_of_fit, stds[0].covariance.largest_std)
+    of_fit = stds[1].std_of_fit * ROOM_RANGE
+    assert stds[1].covariance.largest_std > 1.5 * max(of_fit, stds[0].covariance.largest_std)
 
 
 def test_points_that_occluders_hide_are_removed():

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from piccolo.camera.model import camera_of_fov
+from piccolo.evidence.focal_length import NOT_CALIBRATED
 from piccolo.jobs.threads import Workers
 from piccolo.panorama.cameras import OF_PIXELS
 from research.measuring import outdoor_trials as trials
-from research.synthetic import outdoor_scans as scans, world as worlds
+from research.synthetic import outdoor_photos, outdoor_scans as scans, world as worlds
 from research.synthetic.layout import PLAIN, RoomBuilder
-from research.synthetic.outdoor_photos import take_panorama, take_photo
+from research.synthetic.outdoor_photos import draw_lens, take_panorama, take_photo
 from research.synthetic.outdoors import PLACE_KINDS, SKY, SUN, make_place
 from research.synthetic.raycast import cast_rays
 
@@ -89,9 +90,21 @@ def test_errors_of_stereo_grow_with_the_square_of_the_range_and_are_alike_nearby
     assert 0.3 < np.corrcoef(relative[:-1], relative[1:])[0, 1] < 0.7
 
 
-def test_a_photo_shows_what_rays_from_its_pose_hit():
+def test_lenses_are_as_far_from_ideal_as_is_allowed_for():
+    ideal = camera_of_fov("pinhole", 70.0, 1024, 768)
+    rng = np.random.default_rng(0)
+    drawn = [draw_lens(ideal, rng) for _ in range(400)]
+    focal, fy, x, y, radial = np.array([lens.params[:5] for lens in drawn]).T
+    np.testing.assert_array_equal(focal, ideal.focal[0])
+    off = np.log(fy / focal), (x - 512.0) / focal, (y - 384.0) / fy, radial
+    np.testing.assert_allclose(np.std(off, axis=1), NOT_CALIBRATED, rtol=0.15)
+    np.testing.assert_allclose(np.mean(off, axis=1), 0.0, atol=0.001)
+
+
+def test_a_photo_shows_what_rays_from_its_pose_hit(monkeypatch):
     """A photo of the sky's edge: as bright as the sky where the rays end there."""
     place = make_place("street", 2)
+    monkeypatch.setattr(outdoor_photos, "draw_lens", lambda ideal, _: ideal)
     photo = take_photo(place, 0, WORKERS)
     width, height = SIZE
     assert photo.rgb.shape == (height, width, 3)

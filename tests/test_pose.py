@@ -9,7 +9,7 @@ from poses import covariance, tilted_poses
 from refusals import assert_input_error
 
 from piccolo.geometry import pose as poses
-from piccolo.geometry.nearness import Nearness, non_maximum_suppression
+from piccolo.geometry.nearness import ROOM_RANGE, Nearness, non_maximum_suppression
 from piccolo.geometry.pose import uniform_yaws
 from piccolo.geometry.pose_gaussian import (
     LIKELY,
@@ -113,6 +113,12 @@ def test_rotation_near_the_poles(tiny):
     np.testing.assert_allclose(R @ [0.0, 0.0, -1.0], [0.0, 0.0, 1.0], atol=2e-12)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) == pytest.approx(1.0)
+
+
+def test_limits_of_distances_grow_beyond_rooms_with_what_is_seen():
+    limits = Nearness(0.3, 0.1)
+    assert limits.at(0.5 * ROOM_RANGE) == limits.at(ROOM_RANGE) == limits
+    assert limits.at(3.0 * ROOM_RANGE) == (pytest.approx(0.9), 0.1)
 
 
 def test_kept_poses_are_the_first_of_their_neighbourhood():

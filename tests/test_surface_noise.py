@@ -7,10 +7,12 @@ import rooms
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.surfaces import (
     FULL_SHARE,
+    MIN_CELLS,
     NOISE_CELLS,
     NOISE_SHARE,
     UNKNOWN_DISPLACEMENT,
     displacement,
+    residual_moments,
     share_in_full,
     surface_variance,
 )
@@ -96,6 +98,24 @@ def test_a_thin_scan_has_no_more_noise_for_its_corners_and_furniture(spacing):
     """Of small cells only those with several surfaces are full then; see `surface_variance`."""
     points = rooms.room(2, 400_000)[1].points.astype(np.float64)
     whole, thinned = (build_octree(rooms.voxels(some)) for some in (points, thin(points, spacing)))
-    assert share_in_full(whole, NOISE_CELLS[0]) > FULL_SHARE > share_in_full(thinned, NOISE_CELLS[0])
+    assert share_in_full(whole, *NOISE_CELLS[0]) > FULL_SHARE > share_in_full(thinned, *NOISE_CELLS[0])
     for octree in (whole, thinned):
         assert np.sqrt(np.linalg.eigvalsh(surface_variance(octree)).max()) < 0.003
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_the_noise_of_a_scan_with_a_point_every_10_cm_is_that_of_its_surfaces(noise):
+    """Cells of 32 cm with ten leaves tell it: those of 64 cm are few, or most have several surfaces."""
+    points = _room(800_000)
+    points += np.random.default_rng(1).normal(0.0, noise, points.shape)
+    thinned = thin(points, 0.1)
+    octree = build_octree(rooms.voxels(thinned))
+    assert share_in_full(octree, *NOISE_CELLS[2]) > 2.0 * share_in_full(octree, *NOISE_CELLS[1])
+    assert (
+        len(residual_moments(octree, *NOISE_CELLS[3])[1])
+        < MIN_CELLS
+        < len(residual_moments(octree, *NOISE_CELLS[2])[1])
+    )
+    deviations, _ = _deviations(thinned)
+    assert 0.0 < deviations.max() < 0.001 + 0.6 * noise
+    assert deviations.min() > 0.6 * NOISE_SHARE * noise

@@ -27,10 +27,10 @@ BORDER = 0.08, 0.28  # distance of the surroundings' middle, divided by the radi
 COS_UPRIGHT = 0.8, 0.95  # cosine of an edge's angle to the vertical: not vertical at all, and fully
 VERTICAL_BORDER = 0.9, 0.98
 CELLS = (3, 4)  # levels above the leaves: cells of 16 and 32 cm, by which waves are found
-NOISE_CELLS = (3, 4, 5)  # noise by those of 16 cm, or of 32 or 64 cm where the scan is thin
-FULL_SHARE = (
-    0.4  # of the leaves, least in full cells: in a thinner scan those that are full have two surfaces
-)
+# levels, and least leaves: noise by cells of 16 cm, or of 32 or 64 cm where the scan is thin. Those of 64 cm
+# are the last: in furnished rooms most have several surfaces
+NOISE_CELLS = ((3, 20), (4, 20), (4, 10), (5, 20))
+FULL_SHARE = 0.4  # of the leaves, least in full cells: in a thinner scan those have two surfaces
 MOST_ACROSS = 0.05  # [m] deviation from a cell's plane: cells with more have several surfaces
 MIN_LEAVES = 20
 MIN_CELLS = 200
@@ -140,24 +140,25 @@ def surface_variance(octree: Octree) -> Array:
 
     It is zero for a scan with too few points. Each cell measures one direction, its normal: the tensor
     is the one that fits most cells (least absolute deviations). The cells are the smallest that most surfaces
-    fill: of smaller ones only those with several surfaces are full, which would be taken for noise.
+    fill: of smaller ones only those with several surfaces are full, and most larger ones have several, which
+    would be taken for noise.
     """
-    for levels_up in NOISE_CELLS:
-        if share_in_full(octree, levels_up) < FULL_SHARE:
+    for levels_up, least_leaves in NOISE_CELLS:
+        if share_in_full(octree, levels_up, least_leaves) < FULL_SHARE:
             continue
-        cells = residual_moments(octree, levels_up)
+        cells = residual_moments(octree, levels_up, least_leaves)
         if len(cells[1]) >= MIN_CELLS:
             return fit_tensor(*cells)
     return np.zeros((3, 3))
 
 
-def residual_moments(octree: Octree, levels_up: int) -> tuple[Array, Array]:
+def residual_moments(octree: Octree, levels_up: int, least_leaves: int) -> tuple[Array, Array]:
     """Return normals (C, 3) of the planes through the leaves of a level's fuller cells, and variances (C,).
 
     The variances [m^2] are across the planes.
     """
     found = [(np.empty((0, 3)), np.empty(0))]
-    found += map(moments_of_cells, fit_planes(octree, levels_up))
+    found += map(moments_of_cells, fit_planes(octree, levels_up, least_leaves))
     normals, variances = map(np.concatenate, zip(*found, strict=True))
     return normals, variances
 
@@ -180,19 +181,19 @@ def find_edges_of_cells(octree: Octree, levels_up: int) -> Integers:
     return edges
 
 
-def share_in_full(octree: Octree, levels_up: int) -> float:
-    """Return the share of the leaves that lie in the fuller cells of a level."""
+def share_in_full(octree: Octree, levels_up: int, least_leaves: int) -> float:
+    """Return the share of the leaves that lie in cells of a level with some number of them or more."""
     counts = np.diff(find_edges_of_cells(octree, levels_up))
-    return float(counts[counts >= MIN_LEAVES].sum() / max(counts.sum(), 1))
+    return float(counts[counts >= least_leaves].sum() / max(counts.sum(), 1))
 
 
-def fit_planes(octree: Octree, levels_up: int) -> Iterator[Planes]:
+def fit_planes(octree: Octree, levels_up: int, least_leaves: int = MIN_LEAVES) -> Iterator[Planes]:
     """Yield planes through the leaves of the fuller cells of a level, of some cells at a time.
 
     Of more than MAX_CELLS, so many are taken.
     """
     edges = find_edges_of_cells(octree, levels_up)
-    full = np.flatnonzero(np.diff(edges) >= MIN_LEAVES)
+    full = np.flatnonzero(np.diff(edges) >= least_leaves)
     full = full[np.linspace(0, len(full) - 1, min(len(full), MAX_CELLS)).astype(np.int64)]
     for begin in range(0, len(full), SOME_CELLS):
         some = full[begin : begin + SOME_CELLS]

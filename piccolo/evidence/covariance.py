@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Int64s, Mask
+from ..geometry.nearness import ROOM_RANGE
 from ..geometry.pose import Pose, rotate_points, step, step_between, yaw_rotation
 from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
 from ..geometry.sphere import compute_indices, find_cell, make_grid
@@ -96,6 +97,14 @@ def compute_acting_range(points: Cells) -> float:
     """
     squares = np.square(points.offsets).sum(axis=0, dtype=np.float64)
     return float(np.mean(1.0 / np.maximum(squares, LEAST_ACTING**2)) ** -0.5)
+
+
+def compute_std_of_fit(covariance: Array, acting_range: float) -> float:
+    """Return the largest deviation of a position by its covariance (6, 6), as an angle [rad].
+
+    It is seen from `acting_range` [m]; nearer ones count as in a large room.
+    """
+    return largest_std(covariance) / max(acting_range, ROOM_RANGE)
 
 
 def compute_hessian(problem: ChannelProblem, pose: Pose, turn: float, median_range: float) -> Array:
@@ -328,7 +337,7 @@ def estimate_errors(problem: Problem, candidate: Candidate, workers: Workers) ->
         return errors
     if contradictions(problem.scan_map, found.pose, problem.prior):
         return errors
-    return Errors(found, largest_std(found.covariance - of_layers))
+    return Errors(found, compute_std_of_fit(found.covariance - of_layers, acting_range))
 
 
 def estimate_covariance(
@@ -368,7 +377,7 @@ def estimate_covariance(
     common = scan_covariance(problem.scan_map, acting_range)
     common = common + (1.0 - profile.own_share) * own
     own = profile.own_share * own
-    std_of_fit = largest_std(own + common)
+    std_of_fit = compute_std_of_fit(own + common, acting_range)
     if profile.compares_halves:
         added = disagreement(photo, points, pose, covariance, method.halves_score, workers)
         own = own + turn_positions(added, turned)

@@ -70,10 +70,15 @@ def verify(problem: Problem, pose: Pose, drawn: Matches) -> Verified:
 def place_by_matches(method: Method, pose: Pose, matches: Matches) -> tuple[Pose, Array] | None:
     """Return the pose near another with which most matches with the drawn scan agree, and its covariance.
 
-    None if no more agree than by chance. The covariance (6, 6) is as of `PoseGaussian`.
+    None if no more agree than by chance. The covariance (6, 6) is as of `PoseGaussian`. Of what is farther
+    off than in rooms, matches tell the position as much less exactly: it may be as much farther away.
     """
     found = exact_pose(matches, pose)
-    if found is None or found.num_matches <= method.chance_matches or not CONFIRMED.holds(found.pose, pose):
+    if found is None or found.num_matches <= method.chance_matches:
+        return None
+    points = matches.points[find_inliers(matches, found.pose, COS_EXACT)]
+    ranges = np.linalg.norm(points - found.pose.center_world, axis=1)
+    if not CONFIRMED.at(float(np.median(ranges))).holds(found.pose, pose):
         return None
     return found.pose, DRAWN_INFLATION * match_covariance(matches, found.pose)
 

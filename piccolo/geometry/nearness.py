@@ -10,12 +10,18 @@ from ..kernels.jit import copy_to, kernel
 from .pose import MAX_ANGLE, MAX_DISTANCE, Pose, pose_errors
 from .vectors import dot, minus, row
 
+ROOM_RANGE = 4.0  # [m] chosen, as in halls: what is seen farther off tells a position less exactly
+
 
 class Nearness(NamedTuple):
     """Limits of a distance and of an angle; poses within both are near."""
 
     distance: float  # [m]
     angle: float  # [rad]
+
+    def at(self, distance: float) -> "Nearness":
+        """Return these limits where what is seen is at a distance [m]: beyond rooms theirs grows with it."""
+        return self._replace(distance=self.distance * max(distance / ROOM_RANGE, 1.0))
 
     def holds(self, pose: Pose, other: Pose) -> bool:
         """Return True if two poses are near each other."""

@@ -16,7 +16,8 @@ class Errors(NamedTuple):
     """The errors of a pose that is found; None where the points do not fix it."""
 
     gaussian: PoseGaussian | None  # the pose in the map with its covariance
-    std_of_fit: float | None  # [m] largest deviation if focal length and stitching were exact
+    # largest deviation of the position if focal length and stitching were exact, as an angle [rad]
+    std_of_fit: float | None
 
     def widen(self, common: Array) -> "Errors":
         """Return these with a further error (6, 6) that photos have in common, as of a focal length."""

@@ -30,22 +30,22 @@ class ChoiceModel(NamedTuple):
     """A conditional logit (McFadden, 1974): each pose, and none of them, has odds; they add up to 1."""
 
     weights: tuple[float, ...]  # of a pose's features
-    none_weights: tuple[float, float]  # of none of them: a constant, and log10 of the best's deviation [m]
+    none_weights: tuple[float, float]  # of none of them: a constant, and log10 of the best's deviation [rad]
 
 
-LEAST_STD = 0.003  # [m] deviations below this are taken for it
-MOST_STD = 0.3  # [m] and those above this
+LEAST_STD = 0.00075  # [rad] deviations below this are taken for it: 3 mm in a large room
+MOST_STD = 0.075  # [rad] and those above this
 LEAST_LOGIT_SCORE = 0.02
 LEAST_DRAWN = 0.01
 MOST_RATIO = 1.2
 CONTRADICTED_ODDS = 0.01  # odds that what the user says is wrong
 # By tools/benchmark.py calibration. Each feature counts in one direction only.
 FEATURES = ("log of the ratio", "log of the score", "log of the matches, or of the drawn score")
-NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")
+NONE_FEATURES = ("constant", "log10 of the largest deviation [rad]")
 MODELS: dict[EvidenceKind, ChoiceModel] = {
-    "shape": ChoiceModel((11.0, 1.8, 1.7), (-5.6, 3.3)),
-    "views": ChoiceModel((5.75, 0.43), (4.04, 3.82)),
-    "drawn scan": ChoiceModel((5.38, 1.27, 2.91), (10.61, 3.96)),
+    "shape": ChoiceModel((11.0, 1.8, 1.7), (-3.613, 3.3)),
+    "views": ChoiceModel((5.75, 0.43), (6.34, 3.82)),
+    "drawn scan": ChoiceModel((5.38, 1.27, 2.91), (12.994, 3.96)),
 }
 
 
@@ -69,7 +69,7 @@ def log_odds(standing: Standing, method: Method = METHOD, model: ChoiceModel | N
 def none_features(std: float | None) -> Array:
     """Return the features (2,) of the odds that no pose is right, as NONE_FEATURES names them.
 
-    `std` is the largest deviation [m] of the best pose by image and scan; None where it is not known.
+    `std` is the largest deviation [rad] of the best pose by image and scan; None where it is not known.
     """
     return np.array([1.0, math.log10(min(max(std or MOST_STD, LEAST_STD), MOST_STD))])
 
@@ -82,9 +82,9 @@ def posterior(
 ) -> Array:
     """Return the probabilities (K + 1,) that the place of each of K poses is right, and that none of them is.
 
-    `std_of_fit` is the largest deviation [m] of the best pose with an exact focal length. The default model
-    is that of the poses' evidence. Calibrated for queries of which half were taken in the scan. That no place
-    is right is more likely if the best pose's deviation makes 0.1 m doubtful.
+    `std_of_fit` is the largest deviation of the best position with an exact focal length, as an angle [rad].
+    The default model is that of the poses' evidence. Calibrated for queries of which half were taken in the
+    scan. That no place is right is more likely if the photo fits nearly as well beside the best pose.
     """
     model = model or MODELS[standings[0].evidence]
     logits = [log_odds(standing, method, model) for standing in standings]

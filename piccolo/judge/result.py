@@ -124,7 +124,7 @@ class Result:
     belief: Belief = NOTHING
     # what the method hands on until the result is complete; no file has it, no user sees it
     gaussian: PoseGaussian | None = field(default=None, compare=False, repr=False)  # of the pose, in the map
-    # [m] largest deviation if focal length and stitching were exact
+    # [rad] largest deviation of the position if focal length and stitching were exact
     std_of_fit: float | None = field(default=None, compare=False, repr=False)
     # evidence for the pose and each alternative
     standings: tuple[Standing, ...] = field(default=(), compare=False, repr=False)

@@ -48,7 +48,7 @@ class Outcome(NamedTuple):
     case: str
     standings: list[Standing]  # the best first
     covariance: PoseCovariance | None
-    std_of_fit: float | None  # [m] of the best pose, as of Result
+    std_of_fit: float | None  # [rad] of the best pose, as of Result
     right: int  # of the poses, or their number if none is
     is_refused: bool  # as mirrored: no choice was made
     error: Array  # (6,) of the best pose, as PoseCovariance has it; NaN without truth

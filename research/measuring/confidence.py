@@ -13,13 +13,13 @@ from piccolo import CoarseToFineSettings, Photo
 from piccolo.arrays import Bytes, Values
 from piccolo.cli.command import Arguments, option
 from piccolo.cloud.stream import open_cloud, stream_of_arrays
-from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Stopwatch, Workers, num_cores
 from piccolo.judge.result import Result
 from piccolo.localization.localize import localize
 from piccolo.localization.means import Means
 from piccolo.panorama import read_panorama
+from piccolo.problem.accuracy import PAPER_ACCURACY, Accuracy
 from piccolo.problem.method import METHOD, Method
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
 
@@ -40,8 +40,9 @@ A seed makes rooms, and places that look the same from several positions. Scenes
 queries.json and images; each panorama is localized in each cloud. With --photos, photos of 55 to 90 degrees
 are cut out of the panoramas, processed as by other cameras, and localized in their place. With --outdoors,
 seeds make yards, streets and church fronts instead, each scanned in two ways, with photos and panoramas
-taken there and photos of another. A false answer is a pose with the status localized that is more than 0.1 m
-or 5 degrees off. Writes the trials as JSON lines for tools/benchmark.py calibration, and prints a table.
+taken there and photos of another. A false answer is a pose with the status localized that is farther off than
+--accuracy or 5 degrees. Writes the trials as JSON lines for tools/benchmark.py calibration, and prints a
+table.
 """
 WIDTH = 1024  # of the panoramas [px]
 POINTS_PER_ROOM = 120_000
@@ -229,9 +230,15 @@ def all_trials(arguments: Arguments, workers: Workers) -> Iterator[tuple[str, Po
             yield scene.name, points, trials
 
 
-def localize_trial(scan_map: ScanMap, trial: Trial, workers: Workers, method: Method = METHOD) -> Result:
+def localize_trial(
+    scan_map: ScanMap,
+    trial: Trial,
+    workers: Workers,
+    method: Method = METHOD,
+    accuracy: Accuracy = PAPER_ACCURACY,
+) -> Result:
     """Localize the photo of a trial."""
-    settings = CoarseToFineSettings(gravity=trial.gravity, method=method)
+    settings = CoarseToFineSettings(gravity=trial.gravity, method=method, accuracy=accuracy)
     photo = Photo(trial.rgb, focal_px=trial.focal_px, camera=trial.calibration, mask=trial.is_masked)
     return localize(scan_map, read_panorama(photo), settings, Means(settings.effort, workers, Stopwatch()))
 
@@ -258,14 +265,15 @@ def trial_line(scene: str, trial: Trial, found: Result) -> dict[str, object]:
 class TrialLog:
     """Trials that are written as they come, with their cases for the table."""
 
-    def __init__(self, file: TextIO) -> None:
+    def __init__(self, file: TextIO, accuracy: Accuracy = PAPER_ACCURACY) -> None:
         self.file = file
+        self.nearness = accuracy.nearness  # of right poses
         self.rows: list[Case] = []
 
     def add(self, scene: str, trial: Trial, found: Result) -> Case:
         """Write the line of a trial."""
         truth = trial.true_pose
-        is_right = bool(truth and found.best_pose and RIGHT.holds(found.best_pose, truth))
+        is_right = bool(truth and found.best_pose and self.nearness.holds(found.best_pose, truth))
         self.rows.append((trial.case, found.status, is_right))
         self.file.write(json.dumps(trial_line(scene, trial, found)) + "\n")
         self.file.flush()
@@ -282,6 +290,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--claims", "try photos and scans that say something wrong of their own geometry instead")
     text = "try photos and panoramas of places outdoors instead, scanned by stations, a car, stereo pictures"
     option(parser, "--outdoors KIND ...", text, choices=PLACE_KINDS, default=[])
+    option(parser, "--accuracy METRES", "how exact a pose must be", default=PAPER_ACCURACY.metres)
     option(parser, "--ignore-colors", "localize by the shape of the scans alone")
     option(parser, "--out FILE", "write a JSON line per trial", required=True)
     option(parser, "--threads N", "number of threads", default=num_cores())
@@ -291,11 +300,13 @@ def run(arguments: Arguments) -> int:
     """Localize every trial, write its line, print the table."""
     workers = Workers(arguments.threads)
     with arguments.out.open("w") as file:
-        log = TrialLog(file)
+        accuracy = Accuracy(arguments.accuracy)
+        log = TrialLog(file, accuracy)
         for scene, (points, colors), trials in all_trials(arguments, workers):
             cloud = stream_of_arrays(points.astype(np.float64), None if arguments.ignore_colors else colors)
             scan_map = prepare_map(cloud, workers, has_features=False)
             for trial in trials:
-                case, status, is_right = log.add(scene, trial, localize_trial(scan_map, trial, workers))
+                found = localize_trial(scan_map, trial, workers, accuracy=accuracy)
+                case, status, is_right = log.add(scene, trial, found)
                 arguments.note(f"{scene}: {case}: {status}, {'right' if is_right else 'wrong'}")
     return 1 if print_cases("case", log.rows) else 0

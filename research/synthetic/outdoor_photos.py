@@ -3,8 +3,9 @@
 import numpy as np
 
 from piccolo.arrays import Array
-from piccolo.camera import Mount
+from piccolo.camera import Camera, Mount
 from piccolo.camera.model import camera_of_fov
+from piccolo.evidence.focal_length import NOT_CALIBRATED
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.jobs.threads import Workers
 
@@ -31,6 +32,19 @@ def draw_heading(place: Place, position: Array, rng: np.random.Generator) -> flo
     return float(rng.uniform(0.0, 2.0 * np.pi))
 
 
+def draw_lens(ideal: Camera, rng: np.random.Generator) -> Camera:
+    """Draw the camera that is taken for an ideal one if nothing but its focal length is known.
+
+    Without, what is allowed for would be in no photo, and stated deviations of rotations far too wide.
+    """
+    aspect, right, down, radial = np.array(NOT_CALIBRATED) * rng.normal(size=len(NOT_CALIBRATED))
+    focal = ideal.focal[0]
+    x, y = ideal.center
+    fy = focal * np.exp(aspect)
+    lens = (focal, fy, x + right * focal, y + down * fy, radial, 0.0, 0.0, 0.0)
+    return Camera("OPENCV", ideal.width, ideal.height, tuple(map(float, lens)))
+
+
 def take_photo(place: Place, index: int, workers: Workers) -> Photo:
     """Take photo number `index` of a place, as processed by some phone."""
     rng = np.random.default_rng([place.seed, 62, index])
@@ -40,7 +54,8 @@ def take_photo(place: Place, index: int, workers: Workers) -> Photo:
     R_cam_from_world = R_cam_from_level @ yaw_rotation(draw_heading(place, position, rng))
     camera = camera_of_fov("pinhole", rng.uniform(*FOVS_DEG), *worlds.PHOTO_SIZE)
     pose = Pose(R_cam_from_world, position)
-    rgb = worlds.render_picture(Mount(camera), place.room, pose, workers)
+    lens = draw_lens(camera, np.random.default_rng([place.seed, 65, index]))
+    rgb = worlds.render_picture(Mount(lens), place.room, pose, workers)
     return Photo(worlds.change_sensor(rgb, rng, rng), pose, camera.focal[0])
 
 
