@@ -137,10 +137,14 @@ def test_a_certain_place_counts_whole_however_inexact_the_pose_is(std):
     )
     found = Found(problem, Selection(best, (other,)), None)
     member = bundle_search.PosedMember(found, alone, Pose(np.eye(3), np.zeros(3)))
-    support = bundle_search.find_support(member, problem, best.pose, Workers())
+    (support,) = bundle_search.find_supports(member, problem, [best.pose], Workers())
     assert support.own.pose is best.pose
     assert support.odds > 5e4
     assert [p for _, p in member.own_poses] == [0.99, 0.001]
+    first, second = bundle_search.find_supports(member, problem, [best.pose, other.pose], Workers())
+    assert (first.odds, first.own) == (support.odds, support.own)
+    assert first.odds_elsewhere == pytest.approx(second.odds), "all places are weighed at once"
+    assert second.odds_elsewhere == pytest.approx(first.odds)
 
 
 @pytest.mark.parametrize(("conflict", "is_measured"), [(5.0, True), (5.0, False), (3.0, True), (None, True)])

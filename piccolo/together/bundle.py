@@ -47,7 +47,7 @@ from .bundle_adjustment import (
 from .bundle_search import (
     PosedMember,
     Support,
-    find_support,
+    find_supports,
     move_origin_near,
     propose_bundles,
     weigh_bundles,
@@ -112,7 +112,7 @@ def judge_members(
     for k, member in members.items():
         problem = member.found.problem.forget()
         for bundle, supports in zip(bundles, tested, strict=True):
-            supports[k] = find_support(member, problem, bundle.place(member.cam_from_bundle), workers)
+            (supports[k],) = find_supports(member, problem, [bundle.place(member.cam_from_bundle)], workers)
     probabilities = weigh_bundles([list(supports.values()) for supports in tested], list(members.values()))
     best = int(probabilities[:-1].argmax()) if bundles else 0
     if not bundles or probabilities[best] < EVEN_ODDS:
@@ -124,13 +124,13 @@ def judge_members(
     if not isinstance(agreed, str):  # photos that were not found are refined again from where they now belong
         near = agreed.adjusted.bundle
         supports |= {
-            k: find_support(
+            k: find_supports(
                 members[k],
                 members[k].found.problem.forget(),
-                near.place(members[k].cam_from_bundle),
+                [near.place(members[k].cam_from_bundle)],
                 workers,
                 [near.place(cam) for cam in list_neighbors(members, k)],
-            )
+            )[0]
             for k, support in supports.items()
             if not support.is_found
         }

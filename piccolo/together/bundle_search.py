@@ -19,7 +19,7 @@ from ..jobs.threads import Workers
 from ..judge.by_others import LEAST_NONE, MISSED, local_share
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Errors
-from ..judge.probability import CONTRADICTED_ODDS, posterior
+from ..judge.probability import CONTRADICTED_ODDS, log_odds, posterior
 from ..judge.selection import assess
 from ..localization.ladder import refine
 from ..localization.last_descent import HOPELESS_SCORE
@@ -157,38 +157,60 @@ def vote(member: PosedMember, bundle: Bundle) -> float:
     return max((p for own, p in member.own_poses if ONE_IN_BUNDLE.holds(own.pose, expected)), default=0.0)
 
 
-def find_support(
-    member: Member, problem: Problem, expected: Pose, workers: Workers, exchanged: Sequence[Pose] = ()
-) -> Support:
-    """Return a photo's evidence for a pose that is expected of it: its best own pose near that.
+def find_supports(
+    member: Member,
+    problem: Problem,
+    expected: Sequence[Pose],
+    workers: Workers,
+    exchanged: Sequence[Pose] = (),
+) -> list[Support]:
+    """Return a photo's evidence for each of several poses that may be expected of it.
 
-    `exchanged` are poses that are expected of other photos, one of which may be its own.
+    It is that of its best own pose near the one expected. All of these, and its other poses, are weighed at
+    once, against each other and against that none is right. `exchanged` are poses that are expected of other
+    photos, one of which may be its own.
     """
-    ranked = [own for own, _ in member.own_poses]
-    own = next((h for h in ranked if ONE_IN_BUNDLE.holds(h.pose, expected)), None)
-    found = own or max(list_near(problem, expected, workers), key=lambda h: h.score)
-    if own is None:
-        ranked.append(found)
-    places = [place for place in exchanged if not ONE_IN_BUNDLE.holds(place, expected)]
+    own = [one for one, _ in member.own_poses]
+    ranked = list(own)
+    at = [place_in(ranked, problem, pose, workers) for pose in expected]
+    places = [p for p in exchanged if not any(ONE_IN_BUNDLE.holds(p, pose) for pose in expected)]
     ranked += [examine(problem, p) for p in places if not any(ONE_IN_BUNDLE.holds(h.pose, p) for h in ranked)]
-    k = next(k for k, h in enumerate(ranked) if h is found)
     selection = complete(problem, Selection(ranked[0], tuple(ranked[1:])), workers)
-    ranked = selection.candidates
-    errors = Errors(member.alone.gaussian, member.alone.std_of_fit)
-    fit = member.found.fit
-    if found.pose is not member.found.selection.best.pose and found.score > HOPELESS_SCORE:
-        is_counted = not problem.profile.is_narrow or ranked[k].num_matches is not None
-        counted = ranked[k] if is_counted else count_agreeing(problem, ranked[k], workers)
-        errors = estimate_errors(problem, counted, workers)
-        errors = errors.widen(fit.pose_covariance) if fit else errors
-    p = posterior(assess(problem.profile, selection), errors.std_of_fit, problem.method)
-    none = max(float(p[-1]), LEAST_NONE)
-    odds_elsewhere = float(p[:-1].sum() - p[k]) / none
-    num_places = len(problem.scan_map.sparse)
+    ranked = list(selection.candidates)
+    errors = {k: estimate_errors_at(member, problem, ranked[k], workers) for k in set(at)}
+    standings = assess(problem.profile, selection)
+    likeliest = max(at, key=lambda k: log_odds(standings[k], problem.method))
+    p = posterior(standings, errors[likeliest].std_of_fit, problem.method)
+    odds = p[:-1] / max(float(p[-1]), LEAST_NONE)
     is_there = [any(ONE_IN_BUNDLE.holds(h.pose, place) for place in places) for h in ranked]
-    odds_there = float(p[:-1][is_there].sum()) / none / max(len(places), 1)
-    odds = float(p[k]) / none
-    return Support(ranked[k], errors.gaussian, own is not None, odds, odds_elsewhere, num_places, odds_there)
+    odds_there = float(odds[is_there].sum()) / max(len(places), 1)
+    num = len(problem.scan_map.sparse)
+    is_own = np.arange(len(ranked)) < len(own)
+    elsewhere = odds.sum() - odds
+    return [
+        Support(ranked[k], errors[k].gaussian, bool(is_own[k]), odds[k], elsewhere[k], num, odds_there)
+        for k in at
+    ]
+
+
+def place_in(ranked: list[Candidate], problem: Problem, expected: Pose, workers: Workers) -> int:
+    """Return which of a photo's poses is near the one expected; if none is, append the best near it."""
+    for k, own in enumerate(ranked):
+        if ONE_IN_BUNDLE.holds(own.pose, expected):
+            return k
+    ranked.append(max(list_near(problem, expected, workers), key=lambda one: one.score))
+    return len(ranked) - 1
+
+
+def estimate_errors_at(member: Member, problem: Problem, found: Candidate, workers: Workers) -> Errors:
+    """Return the errors of a photo's own pose: those known of its best, or those estimated at another."""
+    if found.pose is member.found.selection.best.pose or found.score <= HOPELESS_SCORE:
+        return Errors(member.alone.gaussian, member.alone.std_of_fit)
+    is_counted = not problem.profile.is_narrow or found.num_matches is not None
+    counted = found if is_counted else count_agreeing(problem, found, workers)
+    errors = estimate_errors(problem, counted, workers)
+    fit = member.found.fit
+    return errors.widen(fit.pose_covariance) if fit else errors
 
 
 def list_near(problem: Problem, expected: Pose, workers: Workers) -> list[Candidate]:

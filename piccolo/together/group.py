@@ -24,7 +24,7 @@ from ..localization.means import Means
 from ..problem.accuracy import Demand
 from ..scan_map.scan_map import ScanMap
 from .bundle import EVEN_ODDS, judge_placed, place_between, weigh_local
-from .bundle_search import NUM_BUNDLES, Support, find_support, weigh_bundles
+from .bundle_search import NUM_BUNDLES, Support, find_supports, weigh_bundles
 from .links import (
     FIRM,
     WEAK,
@@ -40,7 +40,7 @@ from .links import (
 from .members import Member, Shot, find_members
 from .nearby import localize_nearby
 
-NUM_ANCHORS = 2  # poses of a photo from which a place of the group may follow, the likeliest
+NUM_ANCHORS = 5  # poses of a photo from which a place of the group may follow, the likeliest
 LEAST_LIKELY = 1e-3  # chosen: probability of such a pose
 MOST_SPREAD = 12  # places of the group that are looked at
 BELONGS_WEAKLY = 0.7  # chosen: probability that a photo belongs where few matches put it
@@ -199,7 +199,7 @@ def weigh_places(
     Return also the probability (K + 1,) of each of them, and of none, by all photos that have any of them.
     """
     rivals = [places for places in proposed[1:] if places.keys() & proposed[0].keys()]
-    tested = [examine_place(group, places, numbers, means) for places in (proposed[0], *rivals)]
+    tested = examine_places(group, [proposed[0], *rivals], numbers, means)
     every = sorted({number for one in tested for number in one.supports})
     missed = {k: next(one.supports[k] for one in tested if k in one.supports).miss() for k in every}
     supports = [[one.supports.get(k, missed[k]) for k in every] for one in tested]
@@ -208,16 +208,20 @@ def weigh_places(
     return [tested[k] for k in order], np.append(probabilities[order], probabilities[-1])
 
 
-def examine_place(group: Group, places: Places, numbers: Collection[int], means: Means) -> Tested:
-    """Test a place in each of its photos, and in those that few matches put there."""
-    every = spread(group.links, places, numbers, WEAK)
-    supports = {}
-    for number, placed in every.items():
+def examine_places(
+    group: Group, proposed: Sequence[Places], numbers: Collection[int], means: Means
+) -> list[Tested]:
+    """Test places in each of their photos, and in those that few matches put there."""
+    tested = [Tested(spread(group.links, places, numbers, WEAK), {}) for places in proposed]
+    for number in sorted({number for one in tested for number in one.places}):
         member = group.members[number]
-        support = find_support(member, member.found.problem.forget(), placed.pose, means.workers)
-        belongs = support.belongs if number in places else BELONGS_WEAKLY
-        supports[number] = support._replace(belongs=belongs)
-    return Tested(every, weigh_supports(group.links, every, supports))
+        at = [k for k, one in enumerate(tested) if number in one.places]
+        expected = [tested[k].places[number].pose for k in at]
+        found = find_supports(member, member.found.problem.forget(), expected, means.workers)
+        for k, support in zip(at, found, strict=True):
+            belongs = support.belongs if number in proposed[k] else BELONGS_WEAKLY
+            tested[k].supports[number] = support._replace(belongs=belongs)
+    return [one._replace(supports=weigh_supports(group.links, one.places, one.supports)) for one in tested]
 
 
 def weigh_supports(links: Links, places: Places, supports: Mapping[int, Support]) -> dict[int, Support]:
