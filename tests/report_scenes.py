@@ -21,7 +21,8 @@ from research.synthetic.world import make_world, photograph, pose_of_query, scan
 
 SIZE = np.array([4.5, 3.5, 2.5])
 STOREY = 3.0  # [m] from floor to floor
-NUM_ROOMS, POINTS = 4, 30_000  # a storey
+NUM_ROOMS = 4
+POINTS = 30_000  # of a storey
 EVIDENCE = Evidence(0.82, 0.6, 0.85, 0.9, 0.83, 0.04)
 HOSTILE = (
     "<img src=x onerror=alert(1)>.jpg",
