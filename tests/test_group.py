@@ -1,6 +1,7 @@
 """Photos of one place without relative poses, localized together: links between them, and a room."""
 
 import functools
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,12 +11,13 @@ import rooms
 from groups import SEED, taken_photos
 
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
+from piccolo.geometry.pose_gaussian import PoseGaussian
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.judge.candidate import NO_CANDIDATE
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.panorama import Panorama
 from piccolo.together.bundle_search import Support
-from piccolo.together.group import localize_group, weigh_supports
+from piccolo.together.group import Expected, localize_group, weigh_supports
 from piccolo.together.links import FIRM, WEAK, Links, Placed, compute_shared, find_links, list_pairs, spread
 from piccolo.together.members import Shot
 
@@ -97,6 +99,34 @@ def test_what_several_photos_show_counts_once_and_not_less():
     assert weights[0] == pytest.approx(1.0 / 2.0, abs=0.02)
     assert weights[2] == pytest.approx(1.0 / 3.0, abs=0.02)
     assert weights[3] == 1.0, "it shows something else"
+
+
+def _gaussian(x, std):
+    """A level pose, a distance [m] along x away, with a deviation [m]."""
+    covariance = np.diag([1e-6] * 3 + [std**2] * 3)
+    return PoseGaussian(Pose(np.eye(3), np.array([x, 0.0, 0.0])), covariance, np.zeros((6, 6)))
+
+
+@pytest.mark.parametrize(
+    ("off", "num_matches", "local_share", "std"),
+    [
+        (0.2, 12, 0.02, math.hypot(0.15, 0.03)),  # few matches contradict what is surer
+        (0.2, 12, 0.30, 0.03),  # they are surer
+        (0.2, 300, 0.02, 0.03),  # they are many
+        (0.05, 12, 0.02, 0.03),  # they do not contradict it
+    ],
+)
+def test_of_two_poses_that_contradict_each_other_the_surer_counts(off, num_matches, local_share, std):
+    expected = Expected(_gaussian(off, 0.03), num_matches)
+    tempered = expected.temper(_gaussian(0.0, 0.01), local_share)
+    assert tempered.largest_std == pytest.approx(std)
+    assert tempered.pose is expected.gaussian.pose
+
+
+def test_what_few_matches_tell_alone_may_be_a_local_optimum():
+    few, many = (Expected(_gaussian(0.0, 0.03), count).temper(None, 1.0) for count in (12, 1200))
+    assert few.largest_std == pytest.approx(math.hypot(0.5 * 0.15, 0.03))
+    assert many.largest_std == pytest.approx(0.03, rel=0.05)
 
 
 @functools.lru_cache

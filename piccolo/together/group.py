@@ -16,7 +16,7 @@ from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LIKELY, PoseGaussian
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
-from ..judge.by_others import LOCAL_ERRORS, Shares
+from ..judge.by_others import LOCAL_ERRORS, MISSED, Shares
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result
 from ..local_features.hypotheses import count_matches
@@ -63,6 +63,29 @@ class Tested(NamedTuple):
 
     places: Places
     supports: dict[int, Support]
+
+
+class Expected(NamedTuple):
+    """The pose of a photo by its matches with others."""
+
+    gaussian: PoseGaussian
+    num_matches: int  # that agree with it
+
+    @property
+    def local_share(self) -> float:
+        """Probability that it is a local optimum, as few matches of a wall have."""
+        return MISSED * min(FIRM.least / self.num_matches, 1.0)
+
+    def temper(self, own: PoseGaussian | None, local_share: float) -> PoseGaussian:
+        """Return it with the errors of local optima, as far as it may be one.
+
+        It is one if the photo's own pose contradicts it and is surer: `local_share` is the probability that
+        the own pose is a local optimum.
+        """
+        if own is None:
+            return self.gaussian.blur(self.local_share * LOCAL_ERRORS)
+        is_doubted = local_share < self.local_share and own.square_distance(self.gaussian) > LIKELY
+        return self.gaussian.blur(LOCAL_ERRORS) if is_doubted else self.gaussian
 
 
 class Grouped(NamedTuple):
@@ -280,33 +303,34 @@ def locate_all(links: Links, tested: Tested) -> tuple[dict[int, PoseGaussian], d
     shares = local_shares
     for _ in range(NUM_LOCATED):
         own = {number: one.blur(shares[number] * LOCAL_ERRORS) for number, one in found.items()}
-        expected = expect_all(links, tested.places, own)
+        expected = {
+            k: one.temper(found.get(k), local_shares.get(k, 1.0))
+            for k, one in expect_all(links, tested.places, own).items()
+        }
         shares = {k: weigh_local(local_shares[k], expected.get(k), one) for k, one in found.items()}
     return own, expected
 
 
-def expect_all(links: Links, places: Places, own: Mapping[int, PoseGaussian]) -> dict[int, PoseGaussian]:
+def expect_all(links: Links, places: Places, own: Mapping[int, PoseGaussian]) -> dict[int, Expected]:
     """Return where the others expect each photo, by their own poses or by where they are expected.
 
     A photo whose own pose is uncertain, as of a bare wall, is where it is expected.
     """
     known = {number: one for number, one in own.items() if one.largest_std < MOST_STD_OF_SOURCE}
     located = {number: links.place(number, one.pose) for number, one in known.items()}
-    expected: dict[int, PoseGaussian] = {}
+    expected: dict[int, Expected] = {}
     for number in [*known, *(k for k in places if k not in known)]:
         rest = {k: gaussian for k, gaussian in known.items() if k != number}
         found = expect(links, number, {k: located[k] for k in rest}, rest)
         if found is not None:
             expected[number] = found
             if number not in known:
-                known[number] = found
-                located[number] = links.place(number, found.pose)
+                known[number] = found.gaussian
+                located[number] = links.place(number, found.gaussian.pose)
     return expected
 
 
-def expect(
-    links: Links, number: int, located: Places, known: Mapping[int, PoseGaussian]
-) -> PoseGaussian | None:
+def expect(links: Links, number: int, located: Places, known: Mapping[int, PoseGaussian]) -> Expected | None:
     """Return the pose of a photo by its matches with others; None if too few agree.
 
     Its errors are those of the matches, and of the poses of the photos that tell the most; if few matches
@@ -323,7 +347,8 @@ def expect(
     sources = sorted(telling, key=lambda k: -telling[k])[:MOST_SOURCES]
     shares = np.array([telling[k] for k in sources]) / sum(telling[k] for k in sources)
     attached = [known[k].attach(found.pose @ known[k].pose.inverse(), UNCERTAIN) for k in sources]
-    of_chance = LOCAL_ERRORS if sum(counts.values()) < FIRM.least else UNCERTAIN
+    num_matches = sum(counts.values())
+    of_chance = LOCAL_ERRORS if num_matches < FIRM.least else UNCERTAIN
     own = sum((share**2 * one.own for share, one in zip(shares, attached, strict=True)), of_chance)
     common = sum((share * one.common for share, one in zip(shares, attached, strict=True)), UNCERTAIN)
-    return PoseGaussian(found.pose, own + found.covariance, common)
+    return Expected(PoseGaussian(found.pose, own + found.covariance, common), num_matches)
