@@ -26,7 +26,7 @@ from piccolo.panorama import GPano, Panorama
 from piccolo.photo import Prior
 from piccolo.problem.method import METHOD
 from piccolo.problem.photo_images import MIRROR
-from piccolo.problem.problem import Features, prepare_problem
+from piccolo.problem.problem import Features
 from piccolo.problem.settings import CoarseToFineSettings, Effort
 from research.synthetic.world import mask_outside_field
 
@@ -189,6 +189,7 @@ TILTED_LAST = (2, attempts.search_views, {"tilts": "any", "is_brief": False})
 TILTED = (0, attempts.search_views, {"tilts": "any", "is_brief": False})
 UPRIGHT = [(0, run, {"tilts": "known"}) for run in (attempts.search_briefly, attempts.search_views)]
 ABOUT_LEVEL = [(0, run, {"tilts": "level"}) for run in (attempts.search_briefly, attempts.search_views)]
+LEVEL_LAST = [(2, run, words) for _, run, words in ABOUT_LEVEL]
 
 
 @pytest.mark.parametrize(
@@ -200,30 +201,18 @@ ABOUT_LEVEL = [(0, run, {"tilts": "level"}) for run in (attempts.search_briefly,
         (WHOLE, True, "auto", [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, HALF, ALL]),
         (PARTIAL, False, "auto", [*ABOUT_LEVEL, TILTED]),
         (PARTIAL, False, "known", ABOUT_LEVEL),
-        (PARTIAL, False, "unknown", [*ABOUT_LEVEL, TILTED]),
+        (PARTIAL, False, "unknown", [HALF, ALL, *LEVEL_LAST, TILTED_LAST]),
         (PARTIAL, True, "auto", [*UPRIGHT, TILTED]),
         (PARTIAL, True, "known", UPRIGHT),
     ],
 )
 def test_attempts_are_made_in_this_order(profile, has_tilt, gravity, expected):
-    """Photos of a part of the sphere are searched about level, unless their tilt is known, by views alone."""
-    features = PROBLEM.features if profile.matches_map else ()
+    """Photos of a part of the sphere are searched about level, unless their tilt is known, by views alone.
+
+    Features of the map are asked only if their tilt may be any: else they may have to be made.
+    """
     photo = SimpleNamespace(has_tilt=has_tilt)
-    asked = replace(PROBLEM, profile=profile, photo=photo, gravity=gravity, features=features)
-    assert _list_attempts(asked) == expected
-
-
-@pytest.mark.parametrize("how", ["whole", "part of a sphere", "without colours"])
-def test_only_whole_photos_are_matched_with_features_of_the_map(how):
-    """Those of a map of which none were made yet are not made for a photo of a part of the sphere."""
-    panorama = rooms.as_panorama(rooms.query(1).rgb)
-    if how == "part of a sphere":
-        is_valid = panorama.is_valid.copy()
-        is_valid[:, : is_valid.shape[1] // 3] = False
-        panorama = replace(panorama, is_valid=is_valid)
-    scan_map = replace(rooms.scan_map(1), has_shape=how == "without colours")
-    problem = prepare_problem(panorama, scan_map)
-    assert len(problem.features) == (2 if how == "whole" else 0)
+    assert _list_attempts(replace(PROBLEM, profile=profile, photo=photo, gravity=gravity)) == expected
 
 
 def test_without_features_of_the_map_whole_views_are_searched_alone():

@@ -34,7 +34,6 @@ def test_a_part_seen_by_shape_differs_as_parts_do_and_as_shape_does():
     assert of_shape <= _differences(WHOLE, PARTIAL_SHAPE)
     assert _differences(PARTIAL_SHAPE, WHOLE_SHAPE) == _differences(WHOLE, PARTIAL) - {
         "is_narrow",
-        "matches_map",
         "most_rivals",
         "compares_halves",
     }

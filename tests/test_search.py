@@ -194,7 +194,7 @@ def test_a_known_tilt_is_searched_as_known_whatever_the_photo_shows():
         assert narrow.photo.has_tilt == (gpano is not None)
         planned = [run for _, run in attempts.plan_attempts(narrow) if hasattr(run, "keywords")]
         searched = [run.keywords["tilts"] for run in planned]
-        assert searched == [tilts, "any"]
+        assert searched == [tilts, tilts, "any"], "first the few best starts"
         rotations = search.list_rotations(narrow, tilts, EFFORT)
         if gpano is not None:
             assert len(rotations) == EFFORT.num_yaws

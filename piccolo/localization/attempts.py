@@ -53,10 +53,12 @@ def plan_attempts(problem: Problem) -> list[tuple[Problem, Attempt]]:
     A first look by whole views, or the scan drawn at its poses, may settle a whole upright sphere, and a look
     along walls a photo of edges. Then come searches by whole views: with gravity `auto` as known, then as
     unknown (briefly, for a whole sphere). Poses from matches with features of the map, first of a part of the
-    photo's views, then of all, come last: those of the map may have to be made. Whole photos of any tilt ask
-    them first, partial ones never: these are mostly taken about level, so with a tilt that is not known
+    photo's views, then of all, come last: those of the map may have to be made. Photos of any tilt ask them
+    first, other partial ones never: these are mostly taken about level, so with a tilt that is not known
     exactly, "known" searches about level, first the few best starts.
     """
+    if not problem.profile.matches_map and problem.gravity != "unknown":
+        problem = problem.without_map_features()
     looks_first = bool(problem.features) and can_look_first(problem)
     first: list[tuple[Problem, Attempt]] = []
     if looks_first:

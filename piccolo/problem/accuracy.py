@@ -55,8 +55,8 @@ class Accuracy:
         return Nearness(self.metres, math.radians(self.degrees))
 
     def probability(self, found: PoseGaussian | None) -> float:
-        """Return the probability that a pose is so exact, by its Gaussian; 0 if it is not fixed, None."""
-        return 0.0 if found is None else math.prod(self.parts(found.covariance))
+        """Return the probability that a pose is so exact, by its Gaussian; 1 for None."""
+        return 1.0 if found is None else math.prod(self.parts(found.covariance))
 
     def parts(self, covariance: Array) -> tuple[float, float]:
         """Return the probabilities that position and rotation are so exact, by a covariance (6, 6).

@@ -140,11 +140,10 @@ def prepare_problem(
     if scan_map.has_shape:
         panorama = draw_edges(panorama, R_cam_from_level, scan_map.has_intensity)
     photo = make_photo(panorama, choose_scales(scan_map.has_shape), R_cam_from_level, has_tilt)
-    profile = choose_profile(photo.small.valid_share, photo.is_partial, scan_map.has_shape, method)
     every = cover_sphere(photo.panorama.rgb.shape[1])
     features = tuple(
         Once(find_features, photo.panorama, scan_map, [every[k] for k in half])
-        for half in (HALVES if profile.matches_map else ())
+        for half in (() if scan_map.has_shape else HALVES)
     )
     return Problem(
         source=source,
@@ -153,7 +152,7 @@ def prepare_problem(
         colors=Once(make_texels, panorama),
         scan_map=scan_map,
         views=make_views(scan_map),
-        profile=profile,
+        profile=choose_profile(photo.small.valid_share, photo.is_partial, scan_map.has_shape, method),
         prior=prior,
         gravity=gravity,
         features=features,

@@ -94,7 +94,7 @@ class Profile:
     # the search
     follows_walls: bool = False  # its lines are turned along the walls of the scan, at one tilt after another
     looks_first: bool = True  # unless its tilt is unknown, a brief look by whole views may settle it
-    matches_map: bool = True  # local features of the map propose poses, where views find none
+    matches_map: bool = True  # features of the map propose poses of any tilt; else of an unknown one only
     is_always_upright: bool = False  # it is searched as upright too if its tilt is said to be unknown
     untold_tilt: Tilts = "known"  # as which it is searched if nothing tells its tilt: upright, or about level
     thins_starts: bool = True  # it has fewer starts where there are few candidates
@@ -167,7 +167,6 @@ def by_shape(seen: Profile) -> Profile:
         evidence="shape",
         is_narrow=False,
         follows_walls=True,
-        matches_map=False,
         soft=(SOFT,),
         clear_score=0.1,
         most_rivals=0,

@@ -27,7 +27,7 @@ def localize_nearby(
 ) -> Result | None:
     """Return the result of a photo within reach of others, whose poses in the map are known.
 
-    None if there is no place, or it is not sure there either.
+    None if there is no place, or it is not sure there either, as where its points do not fix it.
     """
     whole = prepare_search(scan_map, shot.panorama, shot.settings, means.watch)
     if whole is None:
@@ -38,7 +38,7 @@ def localize_nearby(
     problem = replace(whole, scan_map=near).without_map_features()
     demand = shot.settings.demand
     found = judge(find(problem, scan_map, means), means, demand, may_promote=False)
-    if found.best_pose is None:
+    if found.best_pose is None or found.gaussian is None:
         return None
     belief = believe_nearby(found.belief, alone.belief, len(whole.scan_map.sparse) / len(near.sparse))
     result = found.take_belief(belief, demand.min_confidence)
