@@ -199,17 +199,17 @@ LEVEL_LAST = [(2, run, words) for _, run, words in ABOUT_LEVEL]
         (WHOLE, False, "known", [LOOK, DRAWN, FIRST_UPRIGHT, HALF, ALL]),
         (WHOLE, False, "unknown", [HALF, ALL, TILTED_LAST]),
         (WHOLE, True, "auto", [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, HALF, ALL]),
-        (PARTIAL, False, "auto", [*ABOUT_LEVEL, TILTED]),
-        (PARTIAL, False, "known", ABOUT_LEVEL),
+        (PARTIAL, False, "auto", [*ABOUT_LEVEL, TILTED, HALF, ALL]),
+        (PARTIAL, False, "known", [*ABOUT_LEVEL, HALF, ALL]),
         (PARTIAL, False, "unknown", [HALF, ALL, *LEVEL_LAST, TILTED_LAST]),
-        (PARTIAL, True, "auto", [*UPRIGHT, TILTED]),
-        (PARTIAL, True, "known", UPRIGHT),
+        (PARTIAL, True, "auto", [*UPRIGHT, TILTED, HALF, ALL]),
+        (PARTIAL, True, "known", [*UPRIGHT, HALF, ALL]),
     ],
 )
 def test_attempts_are_made_in_this_order(profile, has_tilt, gravity, expected):
-    """Photos of a part of the sphere are searched about level, unless their tilt is known, by views alone.
+    """Photos of a part of the sphere are searched about level, unless their tilt is known.
 
-    Features of the map are asked only if their tilt may be any: else they may have to be made.
+    Features of the map are asked last unless the tilt may be any: they may have to be made.
     """
     photo = SimpleNamespace(has_tilt=has_tilt)
     assert _list_attempts(replace(PROBLEM, profile=profile, photo=photo, gravity=gravity)) == expected

@@ -54,11 +54,9 @@ def plan_attempts(problem: Problem) -> list[tuple[Problem, Attempt]]:
     along walls a photo of edges. Then come searches by whole views: with gravity `auto` as known, then as
     unknown (briefly, for a whole sphere). Poses from matches with features of the map, first of a part of the
     photo's views, then of all, come last: those of the map may have to be made. Photos of any tilt ask them
-    first, other partial ones never: these are mostly taken about level, so with a tilt that is not known
-    exactly, "known" searches about level, first the few best starts.
+    first. Partial photos are mostly taken about level: with a tilt that is not known exactly, "known"
+    searches about level, first the few best starts.
     """
-    if not problem.profile.matches_map and problem.gravity != "unknown":
-        problem = problem.without_map_features()
     looks_first = bool(problem.features) and can_look_first(problem)
     first: list[tuple[Problem, Attempt]] = []
     if looks_first:
@@ -71,8 +69,9 @@ def plan_attempts(problem: Problem) -> list[tuple[Problem, Attempt]]:
         for part in parts
     ]
     by_views: list[tuple[Problem, Attempt]] = []
-    asked = problem.without_map_features() if looks_first else problem
     profile = problem.profile
+    matches_last = looks_first or (profile.is_narrow and problem.gravity != "unknown")
+    asked = problem.without_map_features() if matches_last else problem
     if profile.is_always_upright or problem.gravity != "unknown":
         upright: Tilts = "known" if problem.photo.has_tilt else profile.untold_tilt
         if profile.is_narrow:
@@ -80,7 +79,7 @@ def plan_attempts(problem: Problem) -> list[tuple[Problem, Attempt]]:
         by_views.append((asked, partial(search_views, tilts=upright)))
     if problem.gravity != "known":
         by_views.append((asked, partial(search_views, tilts="any", is_brief=looks_first)))
-    return [*first, *by_views, *by_features] if looks_first else [*first, *by_features, *by_views]
+    return [*first, *by_views, *by_features] if matches_last else [*first, *by_features, *by_views]
 
 
 def look_first(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:

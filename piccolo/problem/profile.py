@@ -94,7 +94,6 @@ class Profile:
     # the search
     follows_walls: bool = False  # its lines are turned along the walls of the scan, at one tilt after another
     looks_first: bool = True  # unless its tilt is unknown, a brief look by whole views may settle it
-    matches_map: bool = True  # features of the map propose poses of any tilt; else of an unknown one only
     is_always_upright: bool = False  # it is searched as upright too if its tilt is said to be unknown
     untold_tilt: Tilts = "known"  # as which it is searched if nothing tells its tilt: upright, or about level
     thins_starts: bool = True  # it has fewer starts where there are few candidates
@@ -143,7 +142,6 @@ def of_part(whole: Profile) -> Profile:
         is_partial=True,
         is_narrow=True,
         looks_first=False,
-        matches_map=False,  # views find as many, and the map's features may have to be made
         is_always_upright=True,
         untold_tilt="level",
         thins_starts=False,
