@@ -28,7 +28,7 @@ demo: $(VENV)/ready
 	$(BIN)/python tools/report.py --results demo/poses.jsonl --cloud examples/flat/cloud.ply --out demo/report --plan demo/plan.png --title "Sample flat"
 	@echo "Done: open demo/report/index.html in a browser; demo/overlay.png compares one photo with the scan."
 
-# there is a process for each core: more threads of libraries would take a tenth more time, to wait for one
+# each core has a process: further threads of libraries only wait for a core, and take a tenth more time
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 

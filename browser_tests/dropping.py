@@ -10,6 +10,14 @@ ROOT = Path(__file__).resolve().parents[1]
 FLAT = ROOT / "examples" / "flat"
 SLOW_MS = 120_000  # for a photo, on a machine that does much else
 CHOOSER = "input[type=file][multiple]"
+# keeps the options that are sent in window.told
+LISTEN = """() => {
+  const append = FormData.prototype.append;
+  FormData.prototype.append = function (name, value) {
+    if (name === "options") window.told = JSON.parse(value);
+    append.call(this, name, value);
+  };
+}"""
 PHONE = {"width": 390, "height": 844, "device_scale_factor": 2, "has_touch": True, "is_mobile": True}
 
 

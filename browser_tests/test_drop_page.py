@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from dropping import FLAT, PHONE, answering, choose, giving, list_names, tell_place, wait_for
+from dropping import FLAT, LISTEN, PHONE, answering, choose, giving, list_names, tell_place, wait_for
 
 from piccolo.result_files import read_results
 
@@ -20,15 +20,6 @@ PASTE = """() => {
   const data = new DataTransfer();
   data.items.add(new File(["no picture"], "pasted.png", { type: "image/png" }));
   document.dispatchEvent(new ClipboardEvent("paste", { clipboardData: data }));
-}"""
-
-# keeps the options that are sent in window.told
-LISTEN = """() => {
-  const append = FormData.prototype.append;
-  FormData.prototype.append = function (name, value) {
-    if (name === "options") window.told = JSON.parse(value);
-    append.call(this, name, value);
-  };
 }"""
 
 # says of photos that another helped them

@@ -3,16 +3,7 @@
 from functools import partial
 
 import pytest
-from dropping import FLAT, answering, choose, giving, tell_place, wait_for
-
-# keeps the options that are sent in window.told
-LISTEN = """() => {
-  const append = FormData.prototype.append;
-  FormData.prototype.append = function (name, value) {
-    if (name === "options") window.told = JSON.parse(value);
-    append.call(this, name, value);
-  };
-}"""
+from dropping import FLAT, LISTEN, answering, choose, giving, tell_place, wait_for
 
 WRONG = {
     "Contradicts the place you told": ((29.0, -7.5), "near"),  # at the other end of the flat

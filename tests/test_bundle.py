@@ -347,7 +347,8 @@ def test_a_photo_that_shows_nothing_is_not_localized():
 
 def test_places_that_are_one_for_a_photo_are_one_alternative():
     """Of bundles whose other photos differ."""
-    near, far = [Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.05, 3.0)]
+    near = Pose(np.eye(3), np.array([0.05, 0.0, 0.0]))
+    far = Pose(np.eye(3), np.array([3.0, 0.0, 0.0]))
     places, probabilities = merge_places(
         Pose(np.eye(3), np.zeros(3)), [far, near, far], np.array([4, 3, 2, 1, 6])
     )

@@ -124,7 +124,8 @@ def test_of_two_poses_that_contradict_each_other_the_surer_counts(off, num_match
 
 
 def test_what_few_matches_tell_alone_may_be_a_local_optimum():
-    few, many = (Expected(_gaussian(0.0, 0.03), count).temper(None, 1.0) for count in (12, 1200))
+    few = Expected(_gaussian(0.0, 0.03), 12).temper(None, 1.0)
+    many = Expected(_gaussian(0.0, 0.03), 1200).temper(None, 1.0)
     assert few.largest_std == pytest.approx(math.hypot(0.5 * 0.15, 0.03))
     assert many.largest_std == pytest.approx(0.03, rel=0.05)
 

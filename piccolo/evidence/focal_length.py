@@ -161,11 +161,12 @@ def weigh_claim(prior: FocalPrior, camera: Camera, estimate: Estimate, free: Est
     That is an estimate with the focal length free, and one with all corrections of the lens free.
     """
     claim = make_claim(prior, camera)
-    told, motion = estimate
+    told = estimate.told
+    motion = estimate.motion
     off, variance = marginal(told, claim, FOCAL)
     off -= claim.expected[FOCAL]
     opinion = Opinion(off, variance) if variance < MOST_VARIANCE else None
-    opinions = estimate.told, free.told
+    opinions = told, free.told
     tests = [claim.contradict(one)[0] for one in opinions]
     worst = np.abs(tests).max(axis=0)
     change, total, difference = average(prior, claim, estimate, opinion, float(worst.max()))
@@ -207,17 +208,17 @@ def average(
         wide[FOCAL] = 1.0 / max(opinion.off**2 - opinion.variance, prior.deviation**2)
     if conflict > DISAGREE:
         precision = wide  # the picture says where to look next
-    values, information, _ = estimate.told
-    goal = information @ values + precision * claim.expected
-    total = np.linalg.inv(information + np.diag(precision))
-    return total @ goal, np.asarray(total), np.linalg.inv(information + np.diag(wide)) - total
+    told = estimate.told
+    goal = told.information @ told.values + precision * claim.expected
+    total = np.linalg.inv(told.information + np.diag(precision))
+    return total @ goal, np.asarray(total), np.linalg.inv(told.information + np.diag(wide)) - total
 
 
 def find_errors_of_picture(estimate: Estimate, claim: Claim) -> Array:
     """Return what the corrections would add to a pose's covariance (6, 6) if nothing of the claim holds."""
-    values, information, _ = estimate.told
-    covariance = np.linalg.inv(information + np.diag(claim.wrong_deviations**-2.0))
-    off = covariance @ information @ (values - claim.expected)
+    told = estimate.told
+    covariance = np.linalg.inv(told.information + np.diag(claim.wrong_deviations**-2.0))
+    off = covariance @ told.information @ (told.values - claim.expected)
     return np.asarray(estimate.motion @ (covariance + np.outer(off, off)) @ estimate.motion.T)
 
 

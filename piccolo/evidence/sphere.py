@@ -62,9 +62,9 @@ class SphereFit(NamedTuple):
     def pose_covariance(self) -> Array:
         """Covariance (6, 6) that the geometry adds to a pose: rotation, then centre in the map."""
         covariance = self.covariance
-        told, motion = self.estimate
-        values = told.values
-        information = told.information
+        values = self.estimate.told.values
+        information = self.estimate.told.information
+        motion = self.estimate.motion
         off = covariance @ information @ values  # which is not applied
         beyond = max(1.0 - BY_CHANCE / max(float(values @ information @ values), BY_CHANCE), 0.0)
         return np.asarray(motion @ (covariance + beyond * np.outer(off, off)) @ motion.T)
