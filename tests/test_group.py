@@ -16,6 +16,7 @@ from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.judge.candidate import NO_CANDIDATE
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.panorama import Panorama
+from piccolo.together import group
 from piccolo.together.bundle_search import Support
 from piccolo.together.group import Expected, localize_group, weigh_supports
 from piccolo.together.links import FIRM, WEAK, Links, Placed, compute_shared, find_links, list_pairs, spread
@@ -93,12 +94,26 @@ def test_what_several_photos_show_counts_once_and_not_less():
     links, places = _show_the_same(0.0, 0.0, 0.0, 90.0)
     odds = {0: 2.0, 1: 100.0, 2: 0.5, 3: 0.1}
     supports = {k: SUPPORT._replace(odds=one) for k, one in odds.items()}
-    weights = {k: one.weight for k, one in weigh_supports(links, places, supports).items()}
+    (tested,) = weigh_supports(links, [group.Tested(places, supports)])
+    weights = {k: one.weight for k, one in tested.supports.items()}
     assert list(weights) == [0, 1, 2, 3]
     assert weights[1] == 1.0
     assert weights[0] == pytest.approx(1.0 / 2.0, abs=0.02)
     assert weights[2] == pytest.approx(1.0 / 3.0, abs=0.02)
     assert weights[3] == 1.0, "it shows something else"
+
+
+def test_places_are_compared_by_the_same_evidence():
+    """Two photos of the same, each of which tells more of another place, say nothing of which it is."""
+    links, places = _show_the_same(0.0, 0.0)
+    odds = [{0: 2.0, 1: 100.0}, {0: 100.0, 1: 2.0}, {1: 5.0}]
+    told = [{k: SUPPORT._replace(odds=one) for k, one in of_place.items()} for of_place in odds]
+    tested = weigh_supports(links, [group.Tested(places, supports) for supports in told])
+    weights = [{k: one.weight for k, one in at.supports.items()} for at in tested]
+    assert weights[0] == weights[1]
+    assert weights[2] == {1: weights[0][1]}
+    assert weights[0][0] == pytest.approx(0.75, abs=0.02)
+    assert [one.odds for one in tested[0].supports.values()] == [2.0, 100.0]
 
 
 def _gaussian(x, std):

@@ -135,9 +135,10 @@ def test_copies_are_looked_for_among_poses_that_could_win():
     twin = Pose(here.R_cam_from_world, here.center_world + APART)
     known = [(here, 0.5, 20), (twin, 0.4, 18), (twin, 0.2, 18)]
     found = make_selection(*(replace(make_candidate(0, *told), pose=pose) for pose, *told in known))
-    assert list_copies(problem, found, WORKERS) == [True, True, False]
+    assert list_copies(problem, found.candidates, 0, WORKERS) == [True, True, False]
+    assert list_copies(problem, found.candidates, 1, WORKERS) == [True, True, False]
     workers, asked = rooms.listen()
-    assert list_copies(problem.by_views(), found, workers) == [False, False, False]
+    assert list_copies(problem.by_views(), found.candidates, 0, workers) == [False, False, False]
     assert asked == []
 
 

@@ -1,7 +1,6 @@
 """Copies of a place, as rooms of one kind: poses elsewhere at which the scan looks the same."""
 
 from collections.abc import Sequence
-from itertools import compress
 
 from ..evidence.examine import complete, examine_each
 from ..evidence.verification import find_copies
@@ -24,7 +23,7 @@ def list_reported(
     """
     if not problem.profile.has_shape:
         reported = found.take(found.candidates[: 1 + MAX_ALTERNATIVES])
-        return reported, list_copies(problem, reported, workers)
+        return reported, list_copies(problem, reported.candidates, 0, workers)
     alike = find_alike(problem, found.best.pose, effort, workers)
     reported, is_copy = put_first(found, examine_each(problem, alike, workers))
     return complete(problem, reported, workers), is_copy
@@ -37,12 +36,15 @@ def put_first(found: Selection, copies: Sequence[Candidate]) -> tuple[Selection,
     return found.take([found.best, *others]), [True, *is_copy]
 
 
-def list_copies(problem: Problem, found: Selection, workers: Workers) -> list[bool]:
-    """Return True for the best pose and for copies of its place; of a photo without matches there False."""
-    ranked = found.candidates
+def list_copies(problem: Problem, ranked: Sequence[Candidate], one: int, workers: Workers) -> list[bool]:
+    """Return True for one of ranked candidates, and for copies of its place; False without matches.
+
+    Only those are compared with it that could win beside it or the best, which is the first.
+    """
     if not problem.profile.uses_matches:
         return [False] * len(ranked)
-    is_rival = list_drawn(problem.profile, ranked)[1:]
-    rivals = [h.pose for h in compress(found.alternatives, is_rival)]
-    is_copy = iter(find_copies(problem, found.best.pose, rivals, workers))
-    return [True, *(is_one and next(is_copy) for is_one in is_rival)]
+    is_rival = list_drawn(problem.profile, ranked)
+    others = [k for k in range(len(ranked)) if k != one and is_rival[k]]
+    found = find_copies(problem, ranked[one].pose, [ranked[k].pose for k in others], workers)
+    copies = {k for k, is_copy in zip(others, found, strict=True) if is_copy}
+    return [k == one or k in copies for k in range(len(ranked))]

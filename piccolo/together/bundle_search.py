@@ -12,7 +12,7 @@ from ..arrays import Array
 from ..evidence.covariance import estimate_errors
 from ..evidence.examine import complete, count_agreeing, examine
 from ..evidence.verification import draw_near, verify
-from ..geometry.nearness import ONE_IN_BUNDLE
+from ..geometry.nearness import ONE_IN_BUNDLE, RIGHT
 from ..geometry.pose import Pose, angle_between
 from ..geometry.pose_gaussian import PoseGaussian
 from ..jobs.threads import Workers
@@ -20,7 +20,8 @@ from ..judge.by_others import LEAST_NONE, MISSED, local_share
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Errors
 from ..judge.probability import CONTRADICTED_ODDS, log_odds, posterior
-from ..judge.selection import assess
+from ..judge.selection import assess, credit_copies
+from ..localization.copies import list_copies
 from ..localization.ladder import refine
 from ..localization.last_descent import HOPELESS_SCORE
 from ..problem.problem import Problem
@@ -180,7 +181,8 @@ def find_supports(
     errors = {k: estimate_errors_at(member, problem, ranked[k], workers) for k in set(at)}
     standings = assess(problem.profile, selection)
     likeliest = max(at, key=lambda k: log_odds(standings[k], problem.method))
-    p = posterior(standings, errors[likeliest].std_of_fit, problem.method)
+    is_copy = list_copies(problem, ranked, likeliest, workers)
+    p = posterior(credit_copies(standings, is_copy), errors[likeliest].std_of_fit, problem.method)
     odds = p[:-1] / max(float(p[-1]), LEAST_NONE)
     is_there = [any(ONE_IN_BUNDLE.holds(h.pose, place) for place in places) for h in ranked]
     odds_there = float(odds[is_there].sum()) / max(len(places), 1)
@@ -194,12 +196,20 @@ def find_supports(
 
 
 def place_in(ranked: list[Candidate], problem: Problem, expected: Pose, workers: Workers) -> int:
-    """Return which of a photo's poses is near the one expected; if none is, append the best near it."""
-    for k, own in enumerate(ranked):
-        if ONE_IN_BUNDLE.holds(own.pose, expected):
-            return k
-    ranked.append(max(list_near(problem, expected, workers), key=lambda one: one.score))
-    return len(ranked) - 1
+    """Return which of a photo's poses is near the one expected; if none is, append the best near it.
+
+    One that is not quite there may be a local optimum: the best near the one expected takes its place.
+    """
+    near = next((k for k, own in enumerate(ranked) if ONE_IN_BUNDLE.holds(own.pose, expected)), None)
+    if near is not None and RIGHT.holds(ranked[near].pose, expected):
+        return near
+    found = max(list_near(problem, expected, workers), key=lambda one: one.score)
+    if near is None:
+        ranked.append(found)
+        return len(ranked) - 1
+    if found.score > ranked[near].score:
+        ranked[near] = found
+    return near
 
 
 def estimate_errors_at(member: Member, problem: Problem, found: Candidate, workers: Workers) -> Errors:

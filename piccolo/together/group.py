@@ -5,6 +5,7 @@ Each photo is searched by itself. From each of its likely poses those of the oth
 bundle are. Photos that do not belong to the best place may belong to another; else each keeps its own result.
 """
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from hashlib import sha256
 from typing import NamedTuple
@@ -12,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array
-from ..geometry.nearness import ONE_IN_BUNDLE
+from ..geometry.nearness import ONE_ANSWER, ONE_IN_BUNDLE
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LIKELY, PoseGaussian
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
@@ -145,6 +146,7 @@ def localize_linked(members: Mapping[int, Member], means: Means, demand: Demand)
         left = set(numbers)
         while proposed := propose_places(group, left):
             tested, probabilities = weigh_places(group, proposed, left, means)
+            grouped |= {k: Grouped(one, ()) for k, one in doubt_sure(group, tested, demand).items()}
             found: dict[int, Result] = {}
             if probabilities[0] >= EVEN_ODDS:
                 found = judge_group(group, tested, probabilities, means, demand)
@@ -244,17 +246,46 @@ def examine_places(
         for k, support in zip(at, found, strict=True):
             belongs = support.belongs if number in proposed[k] else BELONGS_WEAKLY
             tested[k].supports[number] = support._replace(belongs=belongs)
-    return [one._replace(supports=weigh_supports(group.links, one.places, one.supports)) for one in tested]
+    return weigh_supports(group.links, tested)
 
 
-def weigh_supports(links: Links, places: Places, supports: Mapping[int, Support]) -> dict[int, Support]:
-    """Weigh the evidence of photos for a place: what several show counts once, by the one that tells most."""
+def weigh_supports(links: Links, tested: Sequence[Tested]) -> list[Tested]:
+    """Weigh the evidence of photos for places: what several show counts once, by the one that tells most.
+
+    A photo has the same weight for each place, so that places are compared by the same evidence.
+    """
+    of_places = [weigh_at(links, one) for one in tested]
+
+    def weigh(number: int, support: Support) -> Support:
+        of_photo = [weights[number] for weights in of_places if number in weights]
+        return support._replace(weight=sum(of_photo) / len(of_photo))
+
+    return [one._replace(supports={k: weigh(k, s) for k, s in one.supports.items()}) for one in tested]
+
+
+def weigh_at(links: Links, tested: Tested) -> dict[int, float]:
+    """Return the weights of the photos by what they show at one place."""
     counted: dict[int, Placed] = {}
-    weights = {}
-    for number in sorted(supports, key=lambda k: (-supports[k].odds, k)):
-        counted[number] = places[number]
+    weights: dict[int, float] = {}
+    for number in sorted(tested.supports, key=lambda k: (-tested.supports[k].odds, k)):
+        counted[number] = tested.places[number]
         weights[number] = 1.0 / (1.0 + compute_shared(links, counted, number))
-    return {number: one._replace(weight=weights[number]) for number, one in supports.items()}
+    return weights
+
+
+def doubt_sure(group: Group, tested: Sequence[Tested], demand: Demand) -> dict[int, Result]:
+    """Return the results of photos that were sure alone, but explain a place elsewhere better."""
+    doubted = {}
+    for number in sorted({number for one in tested for number in one.supports}):
+        member = group.members[number]
+        supports = [one.supports[number] for one in tested if number in one.supports]
+        pose = member.found.selection.best.pose
+        here = max((s.odds for s in supports if ONE_IN_BUNDLE.holds(s.own.pose, pose)), default=math.inf)
+        there = max((s.odds for s in supports if not ONE_ANSWER.holds(s.own.pose, pose)), default=0.0)
+        if member.alone.status == LOCALIZED and there > here:
+            belief = member.alone.belief.scale(here / (here + there))
+            doubted[number] = member.alone.take_belief(belief, demand.min_confidence)
+    return doubted
 
 
 def judge_group(
