@@ -58,15 +58,14 @@ def believe_together(
     return make_belief([place, *(left * bundles[1:-1])], within)
 
 
-def believe_nearby(near: Belief, alone: Belief, gain: float) -> Belief:
+def believe_nearby(near: Belief, elsewhere: float, gain: float) -> Belief:
     """Return the belief in a photo that was searched where others of its group were taken.
 
     `near` is by its own picture, as if a whole scan had been searched, which is `gain` times as large. If it
-    was not taken with the others, its places are those of `alone`. That others tell the place says nothing of
-    local optima: without evidence of its own no photo is exact.
+    was not taken with the others, it has the odds of its places `elsewhere`. That others tell the place says
+    nothing of local optima: without evidence of its own no photo is exact.
     """
     odds = np.array(near.place[:-1]) / max(near.place[-1], LEAST_NONE)
-    elsewhere = sum(alone.place[:-1]) / max(alone.place[-1], LEAST_NONE)
     here = IS_NEARBY * gain * odds
     rest = 1.0 + (1.0 - IS_NEARBY) * elsewhere
     within = near.within * (1.0 - local_share(float(odds[0])))

@@ -310,7 +310,8 @@ def judge_placed(
     within = demand.accuracy.probability(gaussian)
     within_others = 0.0 if expected is None else demand.accuracy.probability_at(gaussian.pose, expected)
     alone = None
-    if member.alone.status == LOCALIZED and is_agreed and member.alone.gaussian:
+    stays = is_agreed and member.is_best(gaussian.pose)
+    if member.alone.status == LOCALIZED and stays and member.alone.gaussian:
         alone = replace(member.alone.belief, within=min(within, member.alone.belief.within))
     elsewhere, probabilities = merge_places(gaussian.pose, elsewhere, probabilities)
     belief = believe_together(shares, probabilities, within, within_others, alone)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array
-from ..geometry.nearness import ONE_ANSWER, ONE_IN_BUNDLE
+from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LIKELY, PoseGaussian
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
@@ -279,9 +279,8 @@ def doubt_sure(group: Group, tested: Sequence[Tested], demand: Demand) -> dict[i
     for number in sorted({number for one in tested for number in one.supports}):
         member = group.members[number]
         supports = [one.supports[number] for one in tested if number in one.supports]
-        pose = member.found.selection.best.pose
-        here = max((s.odds for s in supports if ONE_IN_BUNDLE.holds(s.own.pose, pose)), default=math.inf)
-        there = max((s.odds for s in supports if not ONE_ANSWER.holds(s.own.pose, pose)), default=0.0)
+        here = max((s.odds for s in supports if member.is_best(s.own.pose)), default=math.inf)
+        there = max((s.odds for s in supports if not member.is_best(s.own.pose)), default=0.0)
         if member.alone.status == LOCALIZED and there > here:
             belief = member.alone.belief.scale(here / (here + there))
             doubted[number] = member.alone.take_belief(belief, demand.min_confidence)
@@ -291,7 +290,10 @@ def doubt_sure(group: Group, tested: Sequence[Tested], demand: Demand) -> dict[i
 def judge_group(
     group: Group, tested: Sequence[Tested], probabilities: Array, means: Means, demand: Demand
 ) -> dict[int, Result]:
-    """Return the results of the photos that belong to the first of several places of their group."""
+    """Return the results of the photos that belong to the first of several places of their group.
+
+    There are none if it is one photo, and no other is sure that it was taken there.
+    """
     best, *elsewhere = tested
     own, expected = locate_all(group.links, best)
     results = {}
@@ -304,7 +306,7 @@ def judge_group(
             of_others = None  # few matches contradict what is sure
         placed = place_between(belongs, own.get(number), of_others)
         is_refused = bool(member.alone.belief.ruled_out) and not member.is_misplaced
-        is_own = support.is_found and placed.shares.right >= placed.shares.missed
+        is_own = member.is_best(support.own.pose) and placed.shares.right >= placed.shares.missed
         if is_refused or placed.gaussian is None or belongs.here < EVEN_ODDS:
             continue
         if is_sure and not is_own:  # what is sure alone others do not move
@@ -316,7 +318,13 @@ def judge_group(
         result = judge_placed(member, support, placed, number in own, poses, of_all, means, demand)
         if result.status == LOCALIZED or not is_sure:
             results[number] = result
-    return results
+    return results if len(results.keys() | list_sure(group, best)) > 1 else {}
+
+
+def list_sure(group: Group, tested: Tested) -> set[int]:
+    """List the photos that were sure alone of where a place of their group puts them."""
+    sure = {k for k in tested.supports if group.members[k].alone.status == LOCALIZED}
+    return {k for k in sure if group.members[k].is_best(tested.supports[k].own.pose)}
 
 
 def locate_all(links: Links, tested: Tested) -> tuple[dict[int, PoseGaussian], dict[int, PoseGaussian]]:

@@ -5,6 +5,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from ..geometry.nearness import ONE_IN_BUNDLE
+from ..geometry.pose import Pose
 from ..jobs.memory import check_memory
 from ..jobs.threads import Stopwatch, Workers
 from ..judge.candidate import Candidate
@@ -39,6 +41,10 @@ class Member:
         fit = self.found.fit
         has_conflict = fit is not None and fit.conflict > MOST_CONFLICT
         return has_conflict and prior is not None and prior.is_measured
+
+    def is_best(self, pose: Pose) -> bool:
+        """Return True if a pose is at the place of the best that was found alone."""
+        return ONE_IN_BUNDLE.holds(pose, self.found.selection.best.pose)
 
     @property
     def own_poses(self) -> list[tuple[Candidate, float]]:

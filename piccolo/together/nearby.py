@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..arrays import Array
 from ..geometry.pose import Pose
-from ..judge.by_others import believe_nearby
+from ..judge.by_others import LEAST_NONE, believe_nearby
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result
 from ..localization.judging import judge
@@ -40,13 +41,30 @@ def localize_nearby(
     found = judge(find(problem, scan_map, means), means, demand, may_promote=False)
     if found.best_pose is None or found.gaussian is None:
         return None
-    belief = believe_nearby(found.belief, alone.belief, len(whole.scan_map.sparse) / len(near.sparse))
+    elsewhere = compute_odds_elsewhere(scan_map, alone, located)
+    belief = believe_nearby(found.belief, elsewhere, len(whole.scan_map.sparse) / len(near.sparse))
     result = found.take_belief(belief, demand.min_confidence)
     return result if result.status == LOCALIZED else None
 
 
+def compute_odds_elsewhere(scan_map: ScanMap, alone: Result, located: Sequence[Pose]) -> float:
+    """Return the odds of a photo's places beyond reach of others, against that it has none."""
+    if alone.best_pose is None:
+        return 0.0
+    poses = [alone.best_pose, *(alternative.pose for alternative in alone.alternatives)]
+    centers = np.array([scan_map.from_world(pose).center_world for pose in poses])
+    is_beyond = measure_distances(centers, located) > REACH
+    places = np.array(alone.belief.place)
+    return float(places[:-1][is_beyond].sum() / max(places[-1], LEAST_NONE))
+
+
+def measure_distances(centers: Array, located: Sequence[Pose]) -> Array:
+    """Return the distances (N,) [m] of positions (N, 3) from the nearest of several poses."""
+    offsets = centers[:, None] - [pose.center_world for pose in located]
+    return np.asarray(np.linalg.norm(offsets, axis=-1).min(axis=1))
+
+
 def narrow_around(scan_map: ScanMap, located: Sequence[Pose]) -> ScanMap:
     """Return the map with only those cells of the coarse grid that are within reach of poses."""
-    offsets = scan_map.centers[scan_map.sparse][:, None] - [pose.center_world for pose in located]
-    distances = np.linalg.norm(offsets, axis=-1).min(axis=1)
+    distances = measure_distances(scan_map.centers[scan_map.sparse], located)
     return scan_map.narrow(distances <= REACH + COARSE_SPACING / 2)
