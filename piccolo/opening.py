@@ -204,7 +204,7 @@ def scan_of(
     prepared: ScanMap | PaperMap
     if isinstance(settings, CoarseToFineSettings):
         up = cloud_settings.up
-        prepared = prepare_map(cloud, workers, up, watch, prior=settings.prior, has_features=False)
+        prepared = prepare_map(cloud, workers, up, watch, prior=settings.prior)
     elif not cloud.has_colors:
         raise InputError(f"{cloud.label}: found no colours to be used, wanted some for the preset paper")
     else:

@@ -47,7 +47,7 @@ def main(arguments: Arguments) -> int:
         scan_map = extend_map(arguments.add, arguments.cloud, cloud_settings, name, workers, watch)
     else:
         no_cache = CachePolicy(is_used=False)
-        scan_map = open_map(arguments.cloud, cloud_settings, no_cache, workers, watch, has_features=True)
+        scan_map = open_map(arguments.cloud, cloud_settings, no_cache, workers, watch)
         if arguments.name is not None or not scan_map.scan_names:  # a map keeps its names
             scan_map = name_scan(scan_map, name)
     write_map(scan_map, arguments.out, workers)

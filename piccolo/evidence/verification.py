@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ..arrays import Array, Array32, Bytes
 from ..geometry.nearness import CONFIRMED
@@ -22,7 +21,15 @@ from ..jobs.threads import Workers
 from ..judge.candidate import Drawn
 from ..local_features.hypotheses import COS_EXACT, LEAST_MATCHES, count_matches, exact_pose, find_inliers
 from ..local_features.keypoints import Keypoints, find_in_view, join_keypoints
-from ..local_features.matching import NO_MATCHES, Matches, match_pictures, merge_matches
+from ..local_features.matching import (
+    NO_MATCHES,
+    Located,
+    Matches,
+    match_located,
+    match_pictures,
+    merge_matches,
+    pair,
+)
 from ..local_features.perspective_view import PerspectiveView, add_margin
 from ..local_features.view_image import ViewImage, render_gray
 from ..problem.method import Method
@@ -36,14 +43,6 @@ LEAST_ERROR = 2e-3  # [rad] of a keypoint along an axis: a third of a pixel
 # of the covariance by matches with the drawn scan, whose errors are not independent: by 76 crops of three
 # scenes
 DRAWN_INFLATION = 4.0
-
-
-class Located(NamedTuple):
-    """Keypoints of a picture at a pose in the map, and how far away what they show is."""
-
-    keypoints: Keypoints
-    ranges: Array32  # (N,) [m]
-    pose: Pose
 
 
 class Verified(NamedTuple):
@@ -172,31 +171,6 @@ def match_beside(problem: Problem, other: Located, workers: Workers) -> Matches:
     matches = pair(own, mine, other, theirs)
     rays_of_other = rotate_points(matches.directions.astype(np.float64), other.pose.R_cam_from_world)
     return matches.take(np.sum(rays_of_other * matches.rays, axis=1) < problem.method.cos_agree)
-
-
-def match_located(own: Keypoints, picture: Located) -> Matches:
-    """Match keypoints of a photo with those of a picture whose pose is known."""
-    mine, theirs = match_pictures(own, picture.keypoints)
-    return pair(own, mine, picture, theirs)
-
-
-def pair(own: Keypoints, mine: NDArray[np.intp], picture: Located, theirs: NDArray[np.intp]) -> Matches:
-    """Return the matches of keypoints (M,) of a photo with those (M,) of a picture whose pose is known."""
-    others, ranges, pose = picture
-    R_map_from_cam = pose.R_cam_from_world.T
-    directions = rotate_points(others.rays[theirs].astype(np.float64), R_map_from_cam)
-    tangents = rotate_points(others.tangents[theirs].astype(np.float64), R_map_from_cam)
-    return Matches(
-        mine.astype(np.int32),
-        own.rays[mine],
-        own.tangents[mine],
-        own.sizes[mine],
-        (pose.center_world + directions * ranges[theirs, None]).astype(np.float32),
-        directions.astype(np.float32),
-        tangents.astype(np.float32),
-        others.sizes[theirs] * ranges[theirs],
-        np.ones(len(mine), np.float32),
-    )
 
 
 def draw(problem: Problem, pose: Pose, view: PerspectiveView) -> tuple[ViewImage, Bytes]:

@@ -11,7 +11,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..arrays import Array, Array32, Int64s
 from ..geometry.nearness import MATCHED, VOTED, non_maximum_suppression
@@ -19,7 +18,7 @@ from ..geometry.pose import Pose
 from ..geometry.robust import inline_geman_mcclure
 from ..geometry.vectors import cross, dot, minus, rotate, row
 from ..jobs.threads import Workers
-from ..kernels.jit import F0, Scalar, inline_kernel, kernel
+from ..kernels.jit import Scalar, inline_kernel, kernel
 from ..optimize.levenberg_marquardt import levenberg_marquardt
 from ..optimize.normal_equations import COUNT_SUM, GRADIENT, LOSS, MATRIX
 from .matching import Matches
@@ -120,26 +119,20 @@ def write_turned(m: Matches, j: int, R: Array) -> None:
 
 
 @inline_kernel
-def agreeing_weight(m: Matches, R: Array, t: Array) -> Scalar:
-    """Sum, over the photo's features, the largest weight of a match that roughly agrees with a pose."""
-    total: Scalar = 0.0
+def count_agreeing(m: Matches, R: Array, t: Array) -> int:
+    """Count the photo's features of which a match roughly agrees with a pose."""
+    count = 0
     last = -1
-    best = F0
     for i in range(len(m.query)):
-        if m.query[i] != last:
-            total += best
+        if m.query[i] != last and agreement(m, i, R, t, COS_ROUGH) > 0.0:
+            count += 1
             last = m.query[i]
-            best = F0
-        if agreement(m, i, R, t, COS_ROUGH) > 0.0:
-            best = max(best, m.weights[i])
-    return total + best
+    return count
 
 
 @kernel
-def rough_poses(
-    matches: Matches, voters: NDArray[np.intp], rotations: Array, centers: Array, votes: Array
-) -> None:
-    """Write the pose (n, 3, 3), (n, 3) of each voter, a single match, and the weight (n,) of its votes."""
+def rough_poses(matches: Matches, voters: Int64s, rotations: Array, centers: Array, votes: Int64s) -> None:
+    """Write the pose (n, 3, 3), (n, 3) of each voter, a single match, and the number (n,) of its votes."""
     m = matches
     for k in range(len(voters)):
         j = voters[k]
@@ -147,7 +140,7 @@ def rough_poses(
         for i in range(3):
             centers[k, i] = m.points[j, i] - distance * m.directions[j, i]
         write_turned(m, j, rotations[k])
-        votes[k] = agreeing_weight(m, rotations[k], centers[k])
+        votes[k] = count_agreeing(m, rotations[k], centers[k])
 
 
 @kernel
@@ -254,10 +247,10 @@ def propose_poses(matches: Matches, count: int, workers: Workers) -> list[Matche
 
     Poses with less than FAIR_PART of the best one's matches are left out.
     """
-    voters = np.argsort(-matches.weights, kind="stable")[:MAX_VOTERS]
+    voters = np.arange(0, len(matches.query), 1 + (len(matches.query) - 1) // MAX_VOTERS)
     rotations = np.empty((len(voters), 3, 3))
     centers = np.empty((len(voters), 3))
-    votes = np.empty(len(voters))
+    votes = np.empty(len(voters), np.int64)
 
     def vote(lo: int) -> None:
         part = slice(lo, lo + TRIPLES_A_TASK)

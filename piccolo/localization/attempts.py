@@ -5,7 +5,6 @@ features show that a photo is mirrored, so the first look briefly searches its m
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Protocol
@@ -14,15 +13,14 @@ import numpy as np
 
 from ..evidence.examine import check_prior, choose, examine
 from ..evidence.verification import Verified, draw_near, verify
-from ..geometry.pose import Pose
 from ..jobs.threads import Once, Workers
 from ..judge.candidate import Candidate
 from ..judge.selection import is_clear, is_sure, rank
-from ..local_features.hypotheses import count_matches, propose_poses
-from ..local_features.keypoints import Keypoints, join_keypoints
-from ..local_features.matching import Matches, join_matches
+from ..local_features.hypotheses import MatchedPose, propose_poses
+from ..local_features.matching import Matches, match_located, merge_matches
 from ..photo import NOTHING_KNOWN
 from ..problem.method import Method
+from ..problem.photo_images import find_all_around
 from ..problem.problem import Problem
 from ..problem.profile import Beam, Tilts
 from ..problem.settings import Effort
@@ -35,6 +33,7 @@ from .search import search_poses
 FIRST_BEAM = Beam(100, 12, 4, 1)
 FIRST_ROTATIONS = 1000  # of SO(3)
 FEW_CELLS = 200  # of the grid; if a prior leaves fewer, all of them are searched
+PLACES_AT_ONCE = 64  # at which the scan is drawn
 COS_TILT = math.cos(math.radians(12.0))  # most angle between their vertical and a known one
 
 
@@ -52,34 +51,28 @@ def plan_attempts(problem: Problem) -> list[tuple[Problem, Attempt]]:
 
     A first look by whole views, or the scan drawn at its poses, may settle a whole upright sphere, and a look
     along walls a photo of edges. Then come searches by whole views: with gravity `auto` as known, then as
-    unknown (briefly, for a whole sphere). Poses from matches with features of the map, first of a part of the
-    photo's views, then of all, come last: those of the map may have to be made. Photos of any tilt ask them
-    first. Partial photos are mostly taken about level: with a tilt that is not known exactly, "known"
-    searches about level, first the few best starts.
+    unknown (briefly, for a whole sphere). Matches with the scan drawn at its places come last, as these may
+    have to be drawn, but first for photos of any tilt. Partial photos are mostly taken about level: with a
+    tilt that is not known exactly, "known" searches about level, first the few best starts.
     """
-    looks_first = bool(problem.features) and can_look_first(problem)
+    profile = problem.profile
+    looks_first = profile.uses_matches and can_look_first(problem)
     first: list[tuple[Problem, Attempt]] = []
     if looks_first:
-        first = [(problem.by_views(), look_first), (problem.without_map_features(), draw_found)]
+        first = [(problem.by_views(), look_first), (problem, draw_found)]
     if problem.rotations is not None:
         first.append((problem, look_along_walls))
-    parts = [problem.features[: k + 1] for k in range(len(problem.features))]
-    by_features: list[tuple[Problem, Attempt]] = [
-        (replace(problem, features=part), search_matches if part is parts[-1] else search_part)
-        for part in parts
-    ]
     by_views: list[tuple[Problem, Attempt]] = []
-    profile = problem.profile
-    matches_last = looks_first or (profile.is_narrow and problem.gravity != "unknown")
-    asked = problem.without_map_features() if matches_last else problem
     if profile.is_always_upright or problem.gravity != "unknown":
         upright: Tilts = "known" if problem.photo.has_tilt else profile.untold_tilt
         if profile.is_narrow:
-            by_views.append((asked, partial(search_briefly, tilts=upright)))
-        by_views.append((asked, partial(search_views, tilts=upright)))
+            by_views.append((problem, partial(search_briefly, tilts=upright)))
+        by_views.append((problem, partial(search_views, tilts=upright)))
     if problem.gravity != "known":
-        by_views.append((asked, partial(search_views, tilts="any", is_brief=looks_first)))
-    return [*first, *by_views, *by_features] if matches_last else [*first, *by_features, *by_views]
+        by_views.append((problem, partial(search_views, tilts="any", is_brief=looks_first)))
+    by_features: list[tuple[Problem, Attempt]] = [(problem, search_features)] if profile.uses_matches else []
+    features_last = looks_first or (profile.is_narrow and problem.gravity != "unknown")
+    return [*first, *by_views, *by_features] if features_last else [*first, *by_features, *by_views]
 
 
 def look_first(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
@@ -116,29 +109,40 @@ def look_along_walls(problem: Problem, known: list[Candidate], means: Means) -> 
         return found, is_clear(problem.profile, choose(problem, rank(found), means.workers))
 
 
-def search_part(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
-    """Search by a part of the features; its poses are dropped unless they are sure: all find better ones."""
-    poses, matches = match_poses(problem, means)
-    if not poses or count_matches(matches, poses[0]) < problem.method.enough_matches:
-        return known, False
-    found, is_enough = refine_matched(problem, poses, known, means)
-    return (found, True) if is_enough else (known, False)
+def search_features(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
+    """Match a photo with the scan drawn at its places, some at a time; True if the result is sure.
 
-
-def search_matches(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
-    """Refine the poses that feature matches vote for; True if the result is sure."""
-    poses, _ = match_poses(problem, means)
-    return refine_matched(problem, poses, known, means)
-
-
-def refine_matched(
-    problem: Problem, poses: Sequence[Pose], known: list[Candidate], means: Means
-) -> tuple[list[Candidate], bool]:
-    """Add poses from matches, refined; True if the best is sure."""
+    Poses by some of the places are dropped unless they are sure: all find better ones.
+    """
     workers = means.workers
+    places = problem.scan_map.places
+    matched: list[Matches] = []
+    found = known
     with means.watch.stage("match"):
-        found = known + add_verified(problem, refine_matches(problem, poses, workers), workers)
-        return end_search(problem, found, workers)
+        keypoints = find_all_around(problem.photo, workers)
+    left = places.list_allowed(problem.scan_map.centers[problem.scan_map.sparse])
+    while len(left):
+        part, left = left[:PLACES_AT_ONCE], left[PLACES_AT_ONCE:]
+        with means.watch.stage("match"):
+            pictures = places.draw(part.tolist(), workers)
+            matched += workers.map(partial(match_located, keypoints), pictures, "match")
+            poses = propose_level(problem, merge_matches(matched), workers)
+            if len(left) and (not poses or poses[0].num_matches < problem.method.enough_matches):
+                continue
+            refined = refine_matches(problem, [one.pose for one in poses], workers)
+            found, is_enough = end_search(problem, known + add_verified(problem, refined, workers), workers)
+            if is_enough:
+                return found, True
+    return found, False
+
+
+def propose_level(problem: Problem, matches: Matches, workers: Workers) -> list[MatchedPose]:
+    """Return poses from feature matches, best first; level ones only if the tilt is known."""
+    has_exact_tilt = problem.photo.has_tilt or problem.profile.untold_tilt == "known"
+    is_level = problem.gravity == "known" and has_exact_tilt
+    up_cam = problem.photo.R_cam_from_level[:, 2]
+    found = propose_poses(matches, problem.method.most_matched, workers)
+    return [f for f in found if not is_level or f.pose.R_cam_from_world[:, 2] @ up_cam >= COS_TILT]
 
 
 def search_briefly(
@@ -214,29 +218,6 @@ def search_beyond_prior(problem: Problem, scan_map: ScanMap, means: Means) -> li
     brief = means._replace(effort=means.effort.brief())
     found = search_and_refine(anywhere, "known", FIRST_BEAM, brief)
     return [check_prior(problem, candidate) for candidate in found]
-
-
-def match_poses(problem: Problem, means: Means) -> tuple[list[Pose], Matches]:
-    """Return poses from feature matches, best first, and the matches."""
-    workers = means.workers
-    if problem.scan_map.awaits_features:
-        with means.watch.stage("prepare"):
-            problem.scan_map.features_now(workers)
-    has_exact_tilt = problem.photo.has_tilt or problem.profile.untold_tilt == "known"
-    is_level = problem.gravity == "known" and has_exact_tilt
-    up_cam = problem.photo.R_cam_from_level[:, 2]
-    with means.watch.stage("match"):
-        matches = join_features(problem, workers)[1]
-        poses = [f.pose for f in propose_poses(matches, problem.method.most_matched, workers)]
-    kept = [pose for pose in poses if not is_level or pose.R_cam_from_world[:, 2] @ up_cam >= COS_TILT]
-    return kept, matches
-
-
-def join_features(problem: Problem, workers: Workers) -> tuple[Keypoints, Matches]:
-    """Return the keypoints of all views of a photo, and their matches with features of the map."""
-    parts = [part(workers) for part in problem.features]
-    keypoints = join_keypoints([part.keypoints for part in parts])
-    return keypoints, join_matches([p.matches for p in parts], [len(p.keypoints.rays) for p in parts])
 
 
 def can_look_first(problem: Problem) -> bool:

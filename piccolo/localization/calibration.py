@@ -26,10 +26,10 @@ from ..evidence.sphere import (
 )
 from ..geometry.pose import Pose, rotate_points
 from ..geometry.pose_gaussian import add
-from ..jobs.threads import Once, Workers
+from ..jobs.threads import Workers
 from ..judge.candidate import Selection
 from ..panorama import Panorama
-from ..problem.problem import Features, Problem
+from ..problem.problem import Problem
 from ..problem.stages import Limits
 from .last_descent import refine_best
 
@@ -102,16 +102,8 @@ def recalibrate(problem: Problem, change: Array, workers: Workers) -> Problem:
     before = given.cameras[0]
     after = before.with_camera(before.camera.change(*change))
     taken = given.resample(after.camera, given.rgb.shape[1])
-    features = tuple(Once(partial(_turn_features, part, before, after)) for part in problem.features)
     beside = tuple(m._replace(rays=_turn_rays(m.rays, before, after)) for m in problem.beside)
-    return replace(problem.retake(taken), features=features, beside=beside)
-
-
-def _turn_features(part: Once[Features], before: Mount, after: Mount, workers: Workers) -> Features:
-    """Give the features the rays that another calibration gives to their pixels."""
-    found = part(workers)
-    keypoints = found.keypoints._replace(rays=_turn_rays(found.keypoints.rays, before, after))
-    return Features(keypoints, found.matches._replace(rays=_turn_rays(found.matches.rays, before, after)))
+    return replace(problem.retake(taken), beside=beside)
 
 
 def _turn_rays(rays: Array32, before: Mount, after: Mount) -> Array32:

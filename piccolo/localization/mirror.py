@@ -10,13 +10,11 @@ from ..geometry.pose import Pose, uniform_yaws
 from ..jobs.threads import Workers
 from ..judge.candidate import Candidate
 from ..judge.selection import explains_more
-from ..local_features.hypotheses import propose_poses
-from ..local_features.matching import match
 from ..problem.photo_images import MIRROR
 from ..problem.problem import Problem
 from ..problem.settings import Effort
-from .attempts import FIRST_BEAM, join_features
-from .beam import descend_briefly, refine_matches, refine_starts, score_briefly, score_near
+from .attempts import FIRST_BEAM
+from .beam import descend_briefly, refine_starts, score_briefly, score_near
 from .search import search_poses
 
 FOUND_AGAIN = 0.9  # least score of an end of a brief search, as a fraction of the pose's, to count as found
@@ -46,10 +44,6 @@ def search_mirrored(
     A wall or a ceiling seen from behind fits the mirrored photo: its tilt is that of the pose found, or that
     upside down. The search is brief if a brief one finds the photo's own pose.
     """
-    if problem.features:
-        keypoints = join_features(problem, workers)[0]
-        matches = match(keypoints.mirror(), problem.scan_map.features_now(workers), workers)
-        return refine_matches(mirrored, [f.pose for f in propose_poses(matches, 1, workers)], workers)
     asked = replace(mirrored, rotations=list_mirrored(pose.R_cam_from_world, effort.num_yaws))
     own = replace(problem, rotations=pose.R_cam_from_world @ uniform_yaws(effort.num_yaws))
     own_score = score_near(problem, pose, workers)

@@ -157,3 +157,12 @@ def find_seen(panorama: Panorama, small: Texels, workers: Workers) -> Seen:
     views = [view for view in views if view.cut_mask(mask).any()]
     gray = np.asarray(cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
     return Seen(views, find_keypoints(gray, panorama.is_valid, views, workers))
+
+
+def find_all_around(photo: PhotoImages, workers: Workers) -> Keypoints:
+    """Find a photo's keypoints in all directions, of a whole one also above and below."""
+    if photo.is_partial:
+        return photo.seen(workers).keypoints
+    panorama = photo.panorama
+    gray = np.asarray(cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+    return find_keypoints(gray, panorama.is_valid, cover_sphere(panorama.rgb.shape[1]), workers)

@@ -1,21 +1,16 @@
 """A problem: where in a map was a photo taken? What is asked, and no more: steps hand on what they find."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from ..arrays import Array, Array32
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Gravity, Pose
-from ..jobs.threads import Once, Workers
-from ..local_features.keypoints import Keypoints, find_keypoints
-from ..local_features.matching import Matches, match
-from ..local_features.perspective_view import HALVES, PerspectiveView, cover_sphere
+from ..jobs.threads import Once
+from ..local_features.matching import Matches
 from ..panorama import Panorama
 from ..panorama.edges import draw_edges
 from ..panorama.gpano import rotation_to_level
@@ -36,13 +31,6 @@ AROUND_VOXEL_PER_RANGE = 1 / 150  # of points around a pose, with which the phot
 COARSE_VOXEL_PER_RANGE = 1 / 40  # of coarser ones
 
 
-class Features(NamedTuple):
-    """Keypoints of a photo, and the similar features of the map."""
-
-    keypoints: Keypoints
-    matches: Matches
-
-
 @dataclass(frozen=True)
 class Problem:
     """A photo, the map that it is searched in, and what is known about its pose."""
@@ -56,8 +44,6 @@ class Problem:
     profile: Profile
     prior: Prior
     gravity: Gravity
-    # of a part of the photo's views each, asked with workers; none if views alone propose poses
-    features: tuple[Once[Features], ...]
     rotations: Array | None = None  # (N, 3, 3) camera from map, searched in place of all
     beside: tuple[Matches, ...] = ()  # with each of the photos beside this one whose poses are known
 
@@ -72,20 +58,16 @@ class Problem:
         width: int = min(self.given.rgb.shape[1], self.photo.panorama.rgb.shape[1])
         return math.tau / width
 
-    def without_map_features(self) -> "Problem":
-        """Return the problem in which no features of the map propose poses; those of the drawn scan count."""
-        return replace(self, features=())
-
     def by_views(self) -> "Problem":
         """Return the problem by whole views alone."""
-        return replace(self, features=(), profile=self.profile.by_views())
+        return replace(self, profile=self.profile.by_views())
 
     def show(self, photo: PhotoImages) -> "Problem":
         """Return the problem with other images of the photo, as without what hides the scan."""
         return replace(self, photo=photo)
 
     def forget(self) -> "Problem":
-        """Return the problem without images that were made, but with its features: 100 MB less."""
+        """Return the problem without images that were made: 100 MB less."""
         colors = Once(make_texels, self.given)
         return replace(self, photo=self.photo.forget(), colors=colors, views=make_views(self.scan_map))
 
@@ -95,10 +77,10 @@ class Problem:
         return fresh if self.profile.uses_matches else fresh.by_views()
 
     def mirror(self) -> "Problem":
-        """Return the problem of the mirrored photo, without features of the map and the prior's heading."""
+        """Return the problem of the mirrored photo, without the prior's heading."""
         rotations = None if self.rotations is None else MIRROR @ self.rotations @ MIRROR
         return replace(
-            self.without_map_features(),
+            self,
             photo=self.photo.mirror(),
             prior=self.prior.without_heading(),
             rotations=rotations,
@@ -140,11 +122,6 @@ def prepare_problem(
     if scan_map.has_shape:
         panorama = draw_edges(panorama, R_cam_from_level, scan_map.has_intensity)
     photo = make_photo(panorama, choose_scales(scan_map.has_shape), R_cam_from_level, has_tilt)
-    every = cover_sphere(photo.panorama.rgb.shape[1])
-    features = tuple(
-        Once(find_features, photo.panorama, scan_map, [every[k] for k in half])
-        for half in (() if scan_map.has_shape else HALVES)
-    )
     return Problem(
         source=source,
         given=panorama,
@@ -155,7 +132,6 @@ def prepare_problem(
         profile=choose_profile(photo.small.valid_share, photo.is_partial, scan_map.has_shape, method),
         prior=prior,
         gravity=gravity,
-        features=features,
     )
 
 
@@ -164,15 +140,6 @@ def make_views(scan_map: ScanMap) -> RecentViews:
     # leaves have narrow edges, which only the last descent is near enough to
     averaged = scan_map.octree.without_leaves() if scan_map.has_shape else None
     return RecentViews(scan_map.octree, averaged)
-
-
-def find_features(
-    panorama: Panorama, scan_map: ScanMap, views: Sequence[PerspectiveView], workers: Workers
-) -> Features:
-    """Find the features in several views of a panorama, and match them to the map."""
-    gray = np.asarray(cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
-    keypoints = find_keypoints(gray, panorama.is_valid, views, workers)
-    return Features(keypoints, match(keypoints, scan_map.features_now(workers), workers))
 
 
 def make_texels(panorama: Panorama) -> Texels:

@@ -31,11 +31,10 @@ from ..files.atomic import IS_WINDOWS, replacing
 from ..files.cache import WRITABLE, is_own, make_key, mark_used, own_names, private_folder, recall, remember
 from ..geometry.pose import check_rotation
 from ..geometry.sphere import make_grid
-from ..kernels.jit import F0, F1, inline_kernel, kernel
-from ..local_features.feature_map import MAX_LISTS, MAX_RANGE, MOST_VIEWS, NUM_COMPONENTS, FeatureMap
-from ..local_features.keypoints import DESCRIPTOR_SIZE
+from ..kernels.jit import F0, inline_kernel, kernel
 from ..views.candidate_views import WIDE_RINGS, CandidateViews
-from .scan_map import MAX_SCANS, ScanMap, defer_features, is_name, sparse_candidates
+from .drawn_places import DrawnPlaces
+from .scan_map import MAX_SCANS, ScanMap, is_name, sparse_candidates
 
 Arrays = dict[str, Values]
 WIDE_CELLS = len(make_grid(WIDE_RINGS))
@@ -54,17 +53,6 @@ LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "sparse": ("<i8", ("sparse",)),
     "wide_features": ("|i1", ("sparse", 3 * WIDE_CELLS)),
     "wide_seen": ("|u1", ("sparse", WIDE_CELLS)),
-    "local_points": ("<f4", ("local", 3)),
-    "local_directions": ("|i1", ("local", 3)),
-    "local_tangents": ("|i1", ("local", 3)),
-    "local_sizes": ("<f4", ("local",)),
-    "local_descriptors": ("|i1", ("local", NUM_COMPONENTS)),
-    "local_views": ("<u2", ("local",)),
-    "local_view_centers": ("<f8", ("views", 3)),
-    "local_mean": ("<i2", (DESCRIPTOR_SIZE,)),
-    "local_components": ("|i1", (DESCRIPTOR_SIZE, NUM_COMPONENTS)),
-    "local_middles": ("|i1", ("lists", NUM_COMPONENTS)),
-    "local_list_start": ("<i4", ("list_starts",)),
     "has_labels": ("|b1", ()),
     "has_shape": ("|b1", ()),
     "scan_sha256": ("<U64", ()),
@@ -81,9 +69,9 @@ FARTHEST_LAYERS = 0.2, 1.0  # [rad] and [m] about and along any axis
 MAX_CRS = 4 * 20_000  # [byte]
 MAX_WARNINGS = 1000  # lines
 MAX_WARNING = 5000  # characters of a line
-FORMAT = "piccolo-map/9"
+FORMAT = "piccolo-map/10"
 NAME = own_names("piccolo-map")  # in a cache
-OTHERS = ("octree", "local_features", "scan_names", "warnings", "crs", "is_partial", "views", "late")
+OTHERS = ("octree", "scan_names", "warnings", "crs", "is_partial", "views", "places")
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
 MEMBERS = {*LAYOUT, "format", "scan_names", "warnings"}
 WANTED = "wanted a whole map of tools/prepare_map.py"
@@ -137,7 +125,6 @@ def check_arrays(path: Path, arrays: Arrays) -> None:
     _check_frame(path, arrays)
     _check_octree(path, arrays)
     _check_views(path, arrays)
-    _check_features(path, arrays)
     _check_scans(path, arrays)
     if not SHA256.fullmatch(str(arrays["scan_sha256"])):
         _refuse(path, "a scan_sha256 that is no digest")
@@ -196,37 +183,14 @@ def _check_octree(path: Path, arrays: Arrays) -> None:
 
 
 def _check_views(path: Path, arrays: Arrays) -> None:
-    """Check that candidates and views are within the scan, with values in range, and features have a view.
-
-    The sparse candidates must be those of the coarse grid.
-    """
-    for what, centers in (("view", arrays["local_view_centers"]), ("candidate", arrays["centers"])):
-        if not np.abs(centers).max(initial=0.0) <= _reach(arrays):
-            _refuse(path, f"a {what} at no finite place or too far away")
-    num_views = len(arrays["local_view_centers"])
-    last_view = arrays["local_views"].max(initial=0)
-    if num_views > MOST_VIEWS or last_view >= max(num_views, 1):
-        _refuse(path, f"a feature of view {last_view} of {num_views}")
+    """Check that candidates are within the scan, with values in range, and sparse ones of the coarse grid."""
+    if not np.abs(arrays["centers"]).max(initial=0.0) <= _reach(arrays):
+        _refuse(path, "a candidate at no finite place or too far away")
     for name, (dtype, _) in LAYOUT.items():
         if dtype == "|i1" and arrays[name].min(initial=0) < -127:
             _refuse(path, f"{name} below -127")
     if not np.array_equal(arrays["sparse"], sparse_candidates(arrays["centers"])[0]):
         _refuse(path, "sparse candidates that are not those of the coarse grid")
-
-
-def _check_features(path: Path, arrays: Arrays) -> None:
-    """Check that features are within the scan, and that the lists hold each of them once."""
-    points = arrays["local_points"]
-    sizes = arrays["local_sizes"]
-    start = arrays["local_list_start"]
-    if not np.abs(points).max(initial=F0) <= _reach(arrays) + VOXEL_MARGIN + MAX_RANGE:
-        _refuse(path, "a feature at no finite place or too far away")
-    if not (sizes.min(initial=F1) > F0 and sizes.max(initial=F0) <= MAX_RANGE):
-        _refuse(path, f"features of {sizes.min()} to {sizes.max()} m")
-    if not 1 <= len(arrays["local_middles"]) == len(start) - 1 <= MAX_LISTS:
-        _refuse(path, f"{len(arrays['local_middles'])} lists of features with {len(start)} beginnings")
-    if start[0] != 0 or start[-1] != len(points) or (np.diff(start) < 0).any():
-        _refuse(path, "lists of features that do not follow each other")
 
 
 def _check_scans(path: Path, arrays: Arrays) -> None:
@@ -259,8 +223,8 @@ def save_map(scan_map: ScanMap, path: Path) -> None:
         "crs": np.frombuffer(scan_map.crs.encode(), np.uint8),
     }
     members.update((name, np.asarray(getattr(scan_map, name))) for name in ARRAYS)
-    for label, part in (("octree", scan_map.octree), ("local", scan_map.local_features)):
-        members.update((f"{label}_{name}", np.asarray(value)) for name, value in part._asdict().items())
+    octree = scan_map.octree._asdict()
+    members.update((f"octree_{name}", np.asarray(value)) for name, value in octree.items())
     with replacing(path) as file:
         write_archive(file, members)
 
@@ -341,10 +305,10 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
     }
     parts: dict[str, Any] = {name: arrays[f"octree_{name}"] for name in Octree._fields}
     octree = Octree(**{**parts, "leaf_size": float(arrays["octree_leaf_size"])})
-    scan_map = ScanMap(
+    return ScanMap(
         octree=octree,
         views=CandidateViews(octree, arrays["centers"]),
-        local_features=FeatureMap(**{name: arrays[f"local_{name}"] for name in FeatureMap._fields}),
+        places=DrawnPlaces(octree, arrays["centers"]),
         has_labels=bool(arrays["has_labels"]),
         has_shape=bool(arrays["has_shape"]),
         scan_names=tuple(map(str, arrays["scan_names"])),
@@ -353,4 +317,3 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
         crs=arrays["crs"].tobytes().decode(),
         **own,
     )
-    return defer_features(scan_map) if scan_map.lacks_features else scan_map

@@ -2,7 +2,6 @@
 
 import hashlib
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,12 +14,11 @@ from ..cloud.stream import open_cloud, read_crs
 from ..errors import InputError
 from ..files.cache import cache_root, digest_of_sources, in_words, mark_used, own_folder, sha256_of_files
 from ..geometry.pose import rotate_points
-from ..jobs.threads import Once, Stopwatch, Workers
-from ..local_features.feature_map import FeatureMap
+from ..jobs.threads import Stopwatch, Workers
 from ..photo import NOTHING_KNOWN, Prior
 from .map_file import FORMAT, NAME, is_map_file, load_map, save_map
 from .scan_addition import add_scan
-from .scan_map import ScanMap, add_features, name_scan, prepare_map
+from .scan_map import ScanMap, name_scan, prepare_map
 
 FOLDER = "piccolo-maps"  # within the folder that the user names
 # What makes a map: folders of the package. The cache makes maps anew when one of their files has changed.
@@ -42,12 +40,11 @@ def open_map(
     workers: Workers,
     watch: Stopwatch,
     prior: Prior = NOTHING_KNOWN,
-    has_features: bool = False,
 ) -> ScanMap:
     """Return the map of a cloud's files: prepared already, from the cache, or built now.
 
     `paths` may be a prepared map instead of a cloud. The prior is used only if the scan is too large as a
-    whole. Local features are made when first needed, and cached then, unless `has_features`.
+    whole.
     """
     map_path = find_prepared_map(paths)
     if map_path:
@@ -68,7 +65,7 @@ def open_map(
         with watch.stage("read"):
             cloud = open_cloud(paths, cloud_settings, workers.show)
         up = cloud_settings.up
-        scan_map = prepare_map(cloud, workers, up, watch, prior=prior, has_features=has_features)
+        scan_map = prepare_map(cloud, workers, up, watch, prior=prior)
         has_labels = cloud_settings.labels is not None
         return replace(scan_map, has_labels=has_labels, scan_sha256=digest, crs=read_crs(paths))
 
@@ -83,10 +80,10 @@ def open_map(
 
 
 def write_map(scan_map: ScanMap, path: Path, workers: Workers) -> None:
-    """Write a map with its local features; InputError if it covers only a part of a scan."""
+    """Write a map; InputError if it covers only a part of a scan."""
     if scan_map.is_partial:
         raise InputError(f"{path}: found a map prepared within `near` only, wanted a whole map")
-    save_map(add_features(scan_map, workers), path)
+    save_map(scan_map, path)
 
 
 def extend_map(
@@ -115,7 +112,6 @@ def extend_map(
     check_labels(map_path, old, cloud_settings)
     if crs and old.crs and crs != old.crs:
         workers.warn(f"{paths[0]}: names another coordinate system than the map; the map's is used")
-    old = add_features(old, workers)
     old = old if old.scan_names else name_scan(old, map_path.stem)
     both = "\n".join(sorted([old.scan_sha256, digest]))
     added = add_scan(old, cloud, name, workers, watch)
@@ -170,7 +166,7 @@ def open_cached_map(
                 mark_used(path)
                 scan_map = load_map(path, remembers=True)
             if scan_map.scan_sha256 == scan_sha256:
-                return keep_when_made(scan_map, path), ""
+                return scan_map, ""
             warning = f"{path}: found the map of another scan; it is prepared again"
     except InputError as error:
         warning = f"{error}; it is prepared again"
@@ -184,26 +180,7 @@ def open_cached_map(
             save_map(scan_map, path)
     except OSError as error:
         return scan_map, f"{kept_in}: {error.strerror or error}; the prepared map is not kept"
-    return keep_when_made(scan_map, path), warning
-
-
-def keep_when_made(scan_map: ScanMap, path: Path) -> ScanMap:
-    """Return the map; when its local features are made, it is saved again with them."""
-    late = scan_map.late
-    if late is None:
-        return scan_map
-
-    def make(workers: Workers) -> FeatureMap:
-        with suppress(OSError, InputError):
-            found = load_map(path, remembers=True)
-            if found.scan_sha256 == scan_map.scan_sha256 and not found.lacks_features:
-                return found.local_features
-        features = late(workers)
-        with suppress(OSError):  # they are made again by the next process
-            save_map(replace(scan_map, local_features=features), path)
-        return features
-
-    return replace(scan_map, late=Once(make))
+    return scan_map, warning
 
 
 def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers) -> LocalCloud:

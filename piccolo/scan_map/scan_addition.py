@@ -17,11 +17,11 @@ from ..cloud.voxels import LEAF_SIZE, WINDOW, Voxels, join_voxels
 from ..errors import InputError
 from ..geometry.sphere import whole_areas
 from ..jobs.threads import Stopwatch, Workers
-from ..local_features.feature_map import MOST_VIEWS, FeatureMap, extend_feature_map, view_positions
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, WideViews, render_wide
 from ..views.view import VIEWS_A_TASK, ranges_around
 from .camera_positions import CLEARANCE_VOXEL, MIN_CLEARANCE, Box, candidate_centers
-from .scan_map import ScanMap, check_name, look_for_layers, make_range_lookup, sparse_candidates
+from .drawn_places import DrawnPlaces
+from .scan_map import ScanMap, check_name, look_for_layers, sparse_candidates
 
 BESIDE_SCAN = 3.0  # [m] beside the new scan there may be new places for a camera
 NEARER = 0.9  # of two scans the one in front is nearer by this
@@ -72,7 +72,7 @@ def add_scan(old: ScanMap, cloud: CloudStream, name: str, workers: Workers, watc
             wide_features=wide.features,
             wide_seen=wide.seen,
             views=CandidateViews(octree, found.centers),
-            local_features=join_features(old, octree, found, workers),
+            places=DrawnPlaces(octree, found.centers),
             scan_names=(*old.scan_names, name),
             warnings=tuple(dict.fromkeys(old.warnings + warnings + notes)),
         )
@@ -179,22 +179,3 @@ def assign_scans(old: ScanMap, found: Candidates) -> Uint16s:
         scans[:num_known] = old.scan_of_candidate[found.rows]
     scans[found.is_new] = len(old.scan_names)
     return scans
-
-
-def join_features(old: ScanMap, octree: Octree, found: Candidates, workers: Workers) -> FeatureMap:
-    """Join features: extract them again in changed views, and in new views if they are needed."""
-    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
-
-    view_centers = old.local_features.view_centers
-    gap, place = cKDTree(found.centers).query(view_centers)
-    has_place = gap == 0.0  # it is that of a candidate which stays
-    is_kept = has_place.copy()
-    is_kept[has_place] = found.fraction[place[has_place]] <= LEAST_FOR_FEATURES
-    looked_at = np.concatenate([place[has_place], found.rows_to_render])
-    centers = found.centers[looked_at]
-    num_known = int(np.count_nonzero(has_place))
-    more = view_positions(centers, make_range_lookup(octree, centers), SEARCH_VIEW.num_rings, num_known)
-    anew = np.concatenate([place[has_place & ~is_kept], looked_at[more]])
-    if np.count_nonzero(is_kept) + len(anew) > MOST_VIEWS:
-        raise InputError(f"`add`: found more than {MOST_VIEWS} views with features, the most of one map")
-    return extend_feature_map(old.local_features, is_kept, octree, found.centers[anew], workers)

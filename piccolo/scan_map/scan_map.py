@@ -17,12 +17,11 @@ from ..cloud.surfaces import displacement, paint_shape, surface_variance
 from ..errors import InputError
 from ..geometry.pose import Pose
 from ..gravity.alignment import find_up, find_yaw_of_walls
-from ..jobs.threads import Once, Stopwatch, Workers
-from ..local_features.feature_map import FeatureMap, Look, make_feature_map, view_positions
+from ..jobs.threads import Stopwatch, Workers
 from ..photo import NOTHING_KNOWN, Prior
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, render_wide
-from ..views.view import ranges_around
 from .camera_positions import COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
+from .drawn_places import DrawnPlaces
 from .storeys import Storeys, find_storeys
 
 LOG = logging.getLogger("piccolo")
@@ -46,7 +45,7 @@ class ScanMap(MapFrame):
     wide_features: Int8s  # (sparse, 3 * wide cells) what is seen from them, channels in levels
     wide_seen: Bytes  # (sparse, wide cells) fraction seen of each, 255 for all
     views: CandidateViews  # of fine cells, made when they are asked for; not in files
-    local_features: FeatureMap  # none of any view where they are made late; asked for by `features_now`
+    places: DrawnPlaces  # positions with pictures of the scan, made when they are asked for; not in files
     has_labels: bool = False  # colours are those of labels
     has_shape: bool = False  # colours are edges of the surfaces, of a scan without colours
     scan_names: tuple[str, ...] = ()  # of the scans put together; none if none was named
@@ -54,7 +53,6 @@ class ScanMap(MapFrame):
     scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
     crs: str = ""  # coordinate system that the scan's file names, as WKT or EPSG:code; empty if none
     is_partial: bool = False  # of a scan too large as a whole: candidates where a prior asks; not in files
-    late: Once[FeatureMap] | None = None  # local features of a map prepared without, by Workers; not in files
 
     @cached_property
     def points(self) -> PackedPoints:
@@ -98,20 +96,6 @@ class ScanMap(MapFrame):
             wide_seen=self.wide_seen[is_kept],
         )
 
-    @property
-    def lacks_features(self) -> bool:
-        """True if no view was searched for local features, though there are candidates."""
-        return len(self.local_features.view_centers) == 0 < len(self.centers) and not self.has_shape
-
-    @property
-    def awaits_features(self) -> bool:
-        """True if the local features are made when they are next asked for."""
-        return self.late is not None and not self.late.is_known
-
-    def features_now(self, workers: Workers) -> FeatureMap:
-        """Return the local features, made now if they were deferred."""
-        return self.late(workers) if self.late else self.local_features
-
 
 def sparse_candidates(centers: Array) -> tuple[Int64s, Int64s]:
     """Return indices of the candidates (N, 3) [m] that come first in their cells of the coarse grid.
@@ -151,11 +135,8 @@ def prepare_map(
     up: UpAxis | Array = "auto",
     watch: Stopwatch | None = None,
     prior: Prior = NOTHING_KNOWN,
-    has_features: bool = True,
 ) -> ScanMap:
-    """Prepare a map of a cloud, with local features, or without until a photo needs them.
-
-    Of a cloud without colours it holds the edges of the surfaces in their place, and no local features.
+    """Prepare a map of a cloud; of one without colours it holds the edges of the surfaces in their place.
 
     The named axis is up, with `auto` the file's; or a rotation (3, 3) makes z up. Of a scan too large as a
     whole only the surroundings of the prior's place are prepared; TooManyPositionsError if the prior has no
@@ -182,7 +163,7 @@ def prepare_map(
         centers, notes = find_candidates(octree, R_map_from_world, origin_world, prior, workers)
         sparse, _ = sparse_candidates(centers)
         wide = render_wide(octree, centers[sparse], SEARCH_VIEW, workers)
-        scan_map = ScanMap(
+        return ScanMap(
             octree=octree,
             R_map_from_world=R_map_from_world,
             origin_world=origin_world,
@@ -194,15 +175,11 @@ def prepare_map(
             wide_features=wide.features,
             wide_seen=wide.seen,
             views=CandidateViews(octree, centers),
-            local_features=make_feature_map(octree, centers[:0], Workers()),
+            places=DrawnPlaces(octree, centers),
             warnings=warnings + found + notes,
             is_partial=bool(notes),
             has_shape=has_shape,
         )
-        if has_shape:
-            return scan_map
-        scan_map = defer_features(scan_map)
-        return add_features(scan_map, workers) if has_features else scan_map
 
 
 def look_for_layers(
@@ -220,15 +197,15 @@ def look_for_layers(
 def change_colors(scan_map: ScanMap, octree: Octree, workers: Workers) -> ScanMap:
     """Return the map with an octree of the same points in other colours."""
     wide = render_wide(octree, scan_map.centers[scan_map.sparse], SEARCH_VIEW, workers)
-    changed = replace(
+    return replace(
         scan_map,
         octree=octree,
         wide_features=wide.features,
         wide_seen=wide.seen,
         views=CandidateViews(octree, scan_map.centers),
+        places=DrawnPlaces(octree, scan_map.centers),
         has_shape=False,
     )
-    return defer_features(changed)
 
 
 def check_up(octree: Octree, R_map_from_world: Array, taken: UpAxis) -> tuple[str, ...]:
@@ -244,33 +221,6 @@ def check_up(octree: Octree, R_map_from_world: Array, taken: UpAxis) -> tuple[st
     text = f"the floors face {angle:.0f} deg away from {taken}, which is used as up ({reason})"
     advice = "" if nearest == taken else f"set `up` to {nearest}, or "
     return (f"{text}; {advice}rotate the scan with tools/align_gravity.py",)
-
-
-def find_local_features(scan_map: ScanMap, workers: Workers) -> FeatureMap:
-    """Find local features in views from a few candidates of a map, chosen by what is seen there."""
-    centers = scan_map.centers
-    chosen = view_positions(centers, make_range_lookup(scan_map.octree, centers), SEARCH_VIEW.num_rings)
-    return make_feature_map(scan_map.octree, centers[chosen], workers)
-
-
-def make_range_lookup(octree: Octree, centers: Array) -> Look:
-    """Return a function that maps an index of centres (N, 3) to the ranges seen from there."""
-    return lambda k: ranges_around(octree, centers[k : k + 1], SEARCH_VIEW)[0]
-
-
-def add_features(scan_map: ScanMap, workers: Workers) -> ScanMap:
-    """Return the map with its local features, made now if they are missing."""
-    return replace(scan_map, local_features=scan_map.features_now(workers), late=None)
-
-
-def defer_features(scan_map: ScanMap) -> ScanMap:
-    """Return the map such that it makes its local features when they are first needed."""
-
-    def find(workers: Workers) -> FeatureMap:
-        LOG.info("looking for local features of the scan, once; a map of tools/prepare_map.py has them")
-        return find_local_features(scan_map, workers)
-
-    return replace(scan_map, late=Once(find))
 
 
 def is_name(name: str) -> bool:

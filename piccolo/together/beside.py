@@ -13,7 +13,7 @@ from ..evidence.contradictions import contradictions
 from ..evidence.covariance import split_errors
 from ..evidence.examine import examine
 from ..evidence.focal_length import FocalFit
-from ..evidence.verification import Located, match_beside, match_covariance, place_keypoints
+from ..evidence.verification import match_beside, match_covariance, place_keypoints
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, turn_positions
@@ -23,7 +23,7 @@ from ..judge.conclude import take_pose
 from ..judge.pose_covariance import PoseCovariance
 from ..judge.result import Result, nothing_found
 from ..local_features.hypotheses import exact_pose, propose_poses
-from ..local_features.matching import Matches
+from ..local_features.matching import Located, Matches
 from ..localization.attempts import add_verified
 from ..localization.judging import Found, judge
 from ..localization.last_descent import refine_best

@@ -36,7 +36,7 @@ def localize_nearby(
     near = narrow_around(whole.scan_map, located)
     if len(near.sparse) == 0:
         return None
-    problem = replace(whole, scan_map=near).without_map_features()
+    problem = replace(whole, scan_map=near)
     demand = shot.settings.demand
     found = judge(find(problem, scan_map, means), means, demand, may_promote=False)
     if found.best_pose is None or found.gaussian is None:

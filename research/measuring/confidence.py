@@ -304,7 +304,7 @@ def run(arguments: Arguments) -> int:
         log = TrialLog(file, accuracy)
         for scene, (points, colors), trials in all_trials(arguments, workers):
             cloud = stream_of_arrays(points.astype(np.float64), None if arguments.ignore_colors else colors)
-            scan_map = prepare_map(cloud, workers, has_features=False)
+            scan_map = prepare_map(cloud, workers)
             for trial in trials:
                 found = localize_trial(scan_map, trial, workers, accuracy=accuracy)
                 case, status, is_right = log.add(scene, trial, found)

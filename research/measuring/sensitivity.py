@@ -72,7 +72,7 @@ def list_places(arguments: Arguments, workers: Workers) -> Iterator[Place]:
     for cloud, trials in chain(of_scenes, of_rooms):
         points, colors = cloud
         stream = stream_of_arrays(points.astype(np.float64), colors)
-        yield Place(prepare_map(stream, workers, has_features=True), trials[: 2 * arguments.most])
+        yield Place(prepare_map(stream, workers), trials[: 2 * arguments.most])
 
 
 def measure(places: Sequence[Place], workers: Workers, method: Method = METHOD) -> Measured:
