@@ -26,7 +26,6 @@ PROBLEM = Problem(  # of a photo of which nothing else is asked
     profile=WHOLE,
     prior=NOTHING_KNOWN,
     gravity="auto",
-    features=("half", "other half"),
 )
 
 
@@ -84,5 +83,4 @@ def exact_matches(pose, count, num_wrong=0, seed=0):
     points[wrong] = rng.uniform(-3, 3, (num_wrong, 3))
     values = rays, ray_tangents, angles, points, directions, tangents, angles * ranges
     some = [np.asarray(a, np.float32) for a in values]
-    weights = rng.choice(np.float32([0.5, 1.0]), count)
-    return Matches(np.arange(count, dtype=np.int32), *some, weights)
+    return Matches(np.arange(count, dtype=np.int32), *some)

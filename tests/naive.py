@@ -212,15 +212,6 @@ def view_positions(centers, ranges, num_rings):
     return kept
 
 
-def nearest_places(descriptors, map_descriptors, places, count):
-    """Squared distances (N, count) to the nearest features of the nearest places, and these places."""
-    gaps = descriptors[:, None].astype(int) - map_descriptors[None].astype(int)
-    squares = (gaps**2).sum(axis=2)
-    best = np.stack([squares[:, places == place].min(axis=1) for place in np.unique(places)], axis=1)
-    order = np.argsort(best, axis=1, kind="stable")[:, :count]
-    return np.take_along_axis(best, order, axis=1), np.unique(places)[order]
-
-
 def block_correlation(first, second, shared, blocks, num_blocks):
     """Correlation and area (blocks,) of channels (3, N) over weights (N,)."""
     correlation, area = np.zeros(num_blocks), np.zeros(num_blocks)
@@ -262,8 +253,8 @@ def centered_correlation(features, seen, samples, validity, area, flat, least_se
 
 
 def votes(matches, R_cam_from_map, center_map):
-    """Sum over features of the largest weight of a match within 20 deg, 1.7 in size, 40 deg in turn."""
-    best = {}
+    """Count the features that have a match within 20 deg, 1.7 in size, 40 deg in turn."""
+    agreeing = set()
     for k in range(len(matches.query)):
         seen = R_cam_from_map @ (matches.points[k].astype(float) - center_map)
         distance = np.linalg.norm(seen)
@@ -271,8 +262,8 @@ def votes(matches, R_cam_from_map, center_map):
         ratio = math.log(matches.sizes[k] / (distance * matches.angles[k]))
         turn = math.acos(np.clip(R_cam_from_map @ matches.tangents[k] @ matches.ray_tangents[k], -1.0, 1.0))
         if off < math.radians(20.0) and abs(ratio) < math.log(1.7) and turn < math.radians(40.0):
-            best[matches.query[k]] = max(best.get(matches.query[k], 0.0), float(matches.weights[k]))
-    return sum(best.values())
+            agreeing.add(int(matches.query[k]))
+    return len(agreeing)
 
 
 def profile(leaves, place, radius):

@@ -7,17 +7,25 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rooms
-from made_up import PARTIAL, PROBLEM, WHOLE, exact_matches, make_candidate, make_selection, places
+from made_up import (
+    PARTIAL,
+    PROBLEM,
+    WHOLE,
+    WHOLE_SHAPE,
+    exact_matches,
+    make_candidate,
+    make_selection,
+    places,
+)
 
 from piccolo.evidence.examine import examine
 from piccolo.evidence.verification import round_pose
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import Pose, exp_so3, step
-from piccolo.jobs.threads import Once, Workers
+from piccolo.jobs.threads import Workers
 from piccolo.judge.candidate import Drawn
 from piccolo.judge.probability import LOCALIZED
 from piccolo.judge.selection import is_clear
-from piccolo.local_features.keypoints import join_keypoints
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import attempts, beam, localize as method
 from piccolo.localization.means import NO_TRACE
@@ -26,14 +34,13 @@ from piccolo.panorama import GPano, Panorama
 from piccolo.photo import Prior
 from piccolo.problem.method import METHOD
 from piccolo.problem.photo_images import MIRROR
-from piccolo.problem.problem import Features
 from piccolo.problem.settings import CoarseToFineSettings, Effort
+from piccolo.scan_map.drawn_places import DrawnPlaces
 from research.synthetic.world import mask_outside_field
 
 TIER = "scene"
 
 EFFORT = rooms.KNOWN.effort
-NO_FEATURES = Once(lambda workers: Features(join_keypoints([]), NO_MATCHES))
 
 
 def _localized(panorama, settings=rooms.KNOWN, scan_map=None):
@@ -53,8 +60,7 @@ def _turned_over(panorama):
 
 def test_a_clear_photo_needs_no_features_and_the_result_says_so():
     taken = rooms.query(1)
-    late = Once(lambda workers: pytest.fail("features of a clear photo"))
-    found = _localized(rooms.as_panorama(taken.rgb), scan_map=replace(rooms.scan_map(1), late=late))
+    found = _localized(rooms.as_panorama(taken.rgb), scan_map=replace(rooms.scan_map(1), places=None))
     assert found.status == LOCALIZED
     assert RIGHT.holds(found.pose, taken.pose)
     assert (found.evidence.num_matches, found.evidence.alternative_matches) == (None, None)
@@ -154,7 +160,9 @@ def test_a_tilted_sphere_without_features_is_found_by_whole_views(gravity, is_br
     taken = rooms.query(1, "tilt")
     problem = _problem(rooms.as_panorama(taken.rgb), CoarseToFineSettings(gravity=gravity))
     means = rooms.means()
-    found = method.find(replace(problem, features=(NO_FEATURES,) * 2), rooms.scan_map(1), means)
+    nowhere = DrawnPlaces(rooms.scan_map(1).octree, np.empty((0, 3)))
+    problem = replace(problem, scan_map=replace(problem.scan_map, places=nowhere))
+    found = method.find(problem, rooms.scan_map(1), means)
     pose = found.problem.scan_map.to_world(found.selection.best.pose)
     assert RIGHT.holds(pose, taken.pose)
     last = [made for made in means.trace.steps if made["step"] == "attempt"][-1]
@@ -174,92 +182,99 @@ def test_a_brief_search_keeps_what_little_a_prior_leaves():
 def _list_attempts(problem):
     planned = attempts.plan_attempts(problem)
     return [
-        (len(by.features), run.func, run.keywords) if isinstance(run, partial) else (len(by.features), run)
+        (by.profile.uses_matches, run.func, run.keywords)
+        if isinstance(run, partial)
+        else (by.profile.uses_matches, run)
         for by, run in planned
     ]
 
 
-LOOK = (0, attempts.look_first)
-HALF = (1, attempts.search_part)
-ALL = (2, attempts.search_matches)
-DRAWN = (0, attempts.draw_found)
-FIRST_UPRIGHT = (0, attempts.search_views, {"tilts": "known"})
-FIRST_TILTED = (0, attempts.search_views, {"tilts": "any", "is_brief": True})
-TILTED_LAST = (2, attempts.search_views, {"tilts": "any", "is_brief": False})
-TILTED = (0, attempts.search_views, {"tilts": "any", "is_brief": False})
-UPRIGHT = [(0, run, {"tilts": "known"}) for run in (attempts.search_briefly, attempts.search_views)]
-ABOUT_LEVEL = [(0, run, {"tilts": "level"}) for run in (attempts.search_briefly, attempts.search_views)]
-LEVEL_LAST = [(2, run, words) for _, run, words in ABOUT_LEVEL]
+LOOK = (False, attempts.look_first)
+DRAWN = (True, attempts.draw_found)
+PLACES = (True, attempts.search_features)
+FIRST_UPRIGHT = (True, attempts.search_views, {"tilts": "known"})
+FIRST_TILTED = (True, attempts.search_views, {"tilts": "any", "is_brief": True})
+TILTED = (True, attempts.search_views, {"tilts": "any", "is_brief": False})
+UPRIGHT = [(True, run, {"tilts": "known"}) for run in (attempts.search_briefly, attempts.search_views)]
+ABOUT_LEVEL = [(True, run, {"tilts": "level"}) for run in (attempts.search_briefly, attempts.search_views)]
 
 
 @pytest.mark.parametrize(
     ("profile", "has_tilt", "gravity", "expected"),
     [
-        (WHOLE, False, "auto", [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, HALF, ALL]),
-        (WHOLE, False, "known", [LOOK, DRAWN, FIRST_UPRIGHT, HALF, ALL]),
-        (WHOLE, False, "unknown", [HALF, ALL, TILTED_LAST]),
-        (WHOLE, True, "auto", [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, HALF, ALL]),
-        (PARTIAL, False, "auto", [*ABOUT_LEVEL, TILTED, HALF, ALL]),
-        (PARTIAL, False, "known", [*ABOUT_LEVEL, HALF, ALL]),
-        (PARTIAL, False, "unknown", [HALF, ALL, *LEVEL_LAST, TILTED_LAST]),
-        (PARTIAL, True, "auto", [*UPRIGHT, TILTED, HALF, ALL]),
-        (PARTIAL, True, "known", [*UPRIGHT, HALF, ALL]),
+        (WHOLE, False, "auto", [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, PLACES]),
+        (WHOLE, False, "known", [LOOK, DRAWN, FIRST_UPRIGHT, PLACES]),
+        (WHOLE, False, "unknown", [PLACES, TILTED]),
+        (WHOLE, True, "auto", [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, PLACES]),
+        (PARTIAL, False, "auto", [*ABOUT_LEVEL, TILTED, PLACES]),
+        (PARTIAL, False, "known", [*ABOUT_LEVEL, PLACES]),
+        (PARTIAL, False, "unknown", [PLACES, *ABOUT_LEVEL, TILTED]),
+        (PARTIAL, True, "auto", [*UPRIGHT, TILTED, PLACES]),
+        (PARTIAL, True, "known", [*UPRIGHT, PLACES]),
     ],
 )
 def test_attempts_are_made_in_this_order(profile, has_tilt, gravity, expected):
     """Photos of a part of the sphere are searched about level, unless their tilt is known.
 
-    Features of the map are asked last unless the tilt may be any: they may have to be made.
+    The scan is drawn at its places last unless the tilt may be any: that takes long the first time.
     """
     photo = SimpleNamespace(has_tilt=has_tilt)
     assert _list_attempts(replace(PROBLEM, profile=profile, photo=photo, gravity=gravity)) == expected
 
 
-def test_without_features_of_the_map_whole_views_are_searched_alone():
-    problem = replace(PROBLEM, profile=WHOLE, features=())
-    assert _list_attempts(problem) == [FIRST_UPRIGHT, TILTED]
+def test_without_colours_whole_views_are_searched_alone():
+    problem = replace(PROBLEM, profile=WHOLE_SHAPE)
+    assert [run[1] for run in _list_attempts(problem)] == [attempts.search_views, attempts.search_views]
 
 
 @pytest.mark.parametrize(("sure", "num_made"), [(1, 1), (2, 2), (None, 3)])
 def test_attempts_are_made_until_one_is_sure(sure, num_made):
-    """What is found adds up, and as many features are asked in the end as in the last attempt."""
+    """What is found adds up, by the evidence of the last attempt in the end."""
 
     def run(problem, known, means):
-        num = len(problem.features)
+        num = len(problem.beside)
         return [*known, make_candidate(num, 0.5)], num == sure
 
-    planned = [(replace(PROBLEM, features=PROBLEM.features[:k]), run) for k in (1, 2, 0)]
+    planned = [(replace(PROBLEM, beside=(NO_MATCHES,) * k), run) for k in (1, 2, 0)]
     asked, found = method.make_attempts(planned, rooms.means()._replace(trace=NO_TRACE))
     assert places(found) == [1, 2, 0][:num_made]
-    assert len(asked.features) == places(found)[-1]
+    assert len(asked.beside) == places(found)[-1]
 
 
 @pytest.mark.parametrize(
-    ("num_parts", "num_matches", "has_rival", "is_added"),
+    ("num_places", "num_matches", "has_rival", "num_drawn", "is_sure"),
     [
-        (1, 40, False, True),
-        (1, 39, False, False),
-        (1, 40, True, False),
-        (1, 3, False, False),
-        (2, 39, True, True),
-        (2, 39, False, True),
+        (2, 40, False, 1, True),
+        (2, 39, False, 2, True),
+        (2, 40, True, 2, False),
+        (2, 3, False, 2, False),
+        (1, 39, True, 1, False),
+        (1, 39, False, 1, True),
     ],
 )
-def test_half_of_the_features_count_where_these_leave_no_doubt(num_parts, num_matches, has_rival, is_added):
+def test_some_of_the_places_count_where_these_leave_no_doubt(
+    num_places, num_matches, has_rival, num_drawn, is_sure, monkeypatch
+):
     """As many matches as a clear whole view is worth, and no pose of the first look near it."""
     true = rooms.scene(1)[2]
-    matches = exact_matches(true, num_matches)
-    features = Once(lambda workers: Features(join_keypoints([]), matches))
-    problem = replace(_problem(rooms.scene(1)[1], rooms.UNKNOWN), features=(features,))
+    matches = iter([exact_matches(true, num_matches), NO_MATCHES])
+    monkeypatch.setattr(attempts, "PLACES_AT_ONCE", 1)
+    monkeypatch.setattr(attempts, "match_located", lambda keypoints, picture: next(matches))
+    problem = _problem(rooms.scene(1)[1], rooms.UNKNOWN)
+    drawn = []
+    pictures = SimpleNamespace(
+        choose=lambda *_: np.arange(num_places), draw=lambda places, _: drawn.append(places) or places
+    )
+    problem = replace(problem, scan_map=replace(problem.scan_map, places=pictures))
     own = examine(problem, true)
     looked = replace(own, pose=step(true, np.array([0, 0, 1.5, 2.0, 0, 0])), score=0.9, num_matches=11)
     if has_rival:
         looked = replace(looked, num_matches=200)
-    search = attempts.search_part if num_parts == 1 else attempts.search_matches
-    found, is_enough = search(problem, [looked], rooms.means())
+    found, is_enough = attempts.search_features(problem, [looked], rooms.means())
     assert found[0].pose is looked.pose
-    assert len(found) == 1 + is_added
-    assert is_enough == (is_added and not has_rival)
+    assert is_enough == is_sure
+    assert drawn == [[0], [1]][:num_drawn]
+    assert len(found) == (1 if num_matches == 3 else 2)
     assert all(RIGHT.holds(h.pose, true) for h in found[1:])
 
 

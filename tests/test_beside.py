@@ -66,7 +66,6 @@ def _matches_of(pose, noise, rng, count=60):
         points=np.float32(points),
         tangents=np.float32(tangents @ pose.R_cam_from_world),
         sizes=sizes,
-        weights=np.ones(count, np.float32),
     )
 
 

@@ -159,7 +159,7 @@ def test_photos_that_were_moved_are_aligned_and_paint_the_room():
 def _gray_map(cloud):
     """A map of a scan's shape alone."""
     gray = replace(cloud, colors=np.full_like(cloud.colors, 128), has_colors=False)
-    return prepare_map(rooms.stream(gray), Workers(2), has_features=False)
+    return prepare_map(rooms.stream(gray), Workers(2))
 
 
 @functools.lru_cache

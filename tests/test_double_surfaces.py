@@ -138,7 +138,7 @@ def test_the_map_warns_of_layers_once_and_says_where_they_are():
             points.astype(np.float32), np.full(points.shape, 99, np.uint8), np.array([70.0, 7.0, 0.7])
         )
     )
-    prepared = prepare_map(cloud, replace(WORKERS, warn=told.append), has_features=False)
+    prepared = prepare_map(cloud, replace(WORKERS, warn=told.append))
     (text,) = [warning for warning in prepared.warnings if "layers" in warning]
     assert told.count(text) == 1
     wanted = (
@@ -189,7 +189,7 @@ def test_a_scan_whose_end_was_moved_widens_the_covariance_in_all_directions(monk
     points = cloud.points.copy()
     points[points[:, 0] > np.quantile(points[:, 0], 0.6)] += np.float32([0.02, -0.05, 0.01])
     moved = rooms.Cloud(points, cloud.colors, cloud.origin_world)
-    scan_map = prepare_map(rooms.stream(moved), WORKERS, has_features=False)
+    scan_map = prepare_map(rooms.stream(moved), WORKERS)
     assert not scan_map.layers.any()
     asked = rooms.as_panorama(taken.rgb)
     found = rooms.locate(asked, scan_map, rooms.KNOWN)

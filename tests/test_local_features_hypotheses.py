@@ -13,10 +13,11 @@ from piccolo.evidence.contradictions import contradictions
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.threads import Workers
 from piccolo.judge.reasons import explain
-from piccolo.local_features.feature_map import make_feature_map
 from piccolo.local_features.hypotheses import count_matches, exact_pose, propose_poses, rough_poses
-from piccolo.localization.attempts import join_features, match_poses
+from piccolo.local_features.matching import match_located, merge_matches
+from piccolo.localization.attempts import search_features
 from piccolo.photo import Prior
+from piccolo.problem.photo_images import find_all_around
 from piccolo.problem.settings import CoarseToFineSettings
 
 TIER = "scene"
@@ -29,7 +30,10 @@ def _problem(seed, variant="clean"):
 
 
 def _matches(problem):
-    return join_features(problem, rooms.WORKERS)[1]
+    places = problem.scan_map.places
+    pictures = places.draw(range(len(places.positions)), rooms.WORKERS)
+    keypoints = find_all_around(problem.photo, rooms.WORKERS)
+    return merge_matches([match_located(keypoints, picture) for picture in pictures])
 
 
 def _true_pose(seed, variant="clean"):
@@ -43,7 +47,7 @@ def test_one_exact_match_gives_the_pose_and_its_votes_equal_their_twin():
     matches = exact_matches(POSE, 40, num_wrong=10)
     matches = matches._replace(query=np.repeat(np.arange(20, dtype=np.int32), 2))
     voters = np.arange(40)
-    rotations, centers, votes = np.empty((40, 3, 3)), np.empty((40, 3)), np.empty(40)
+    rotations, centers, votes = np.empty((40, 3, 3)), np.empty((40, 3)), np.empty(40, np.int64)
     rough_poses(matches, voters, rotations, centers, votes)
     np.testing.assert_allclose(centers[:30], np.tile(POSE.center_world, (30, 1)), atol=1e-4)
     np.testing.assert_allclose(rotations[:30], np.tile(POSE.R_cam_from_world, (30, 1, 1)), atol=2e-3)
@@ -114,8 +118,8 @@ def test_matches_beyond_a_prior_are_asked_too():
     x, y, _ = rooms.query(1).pose.center_world
     prior = Prior(near=(x + 1.4, y, None), radius=0.5)
     asked = replace(_problem(1), prior=prior, gravity="known")
-    poses, _ = match_poses(asked, rooms.means())
-    assert any(rooms.errors(pose, _true_pose(1))[0] < 0.1 for pose in poses)
+    found, _ = search_features(asked, [], rooms.means())
+    assert any(rooms.errors(one.pose, _true_pose(1))[0] < 0.1 for one in found)
 
 
 def test_a_prior_that_excludes_the_place_makes_no_pose_sure():
@@ -125,16 +129,3 @@ def test_a_prior_that_excludes_the_place_makes_no_pose_sure():
     result = rooms.locate(rooms.scene(1)[1], rooms.scan_map(1), settings)
     assert result.status == "not_localized"
     assert "from the place given, not within 0.5 m" in result.warnings[-1]
-
-
-def test_without_features_the_search_finds_the_pose():
-    scan_map = rooms.scan_map(1)
-    nothing = make_feature_map(scan_map.octree, np.empty((0, 3)), Workers())
-    featureless = replace(scan_map, local_features=nothing)
-    settings = rooms.KNOWN
-    result = rooms.locate(rooms.scene(1)[1], featureless, settings)
-    assert rooms.errors(result.pose, rooms.query(1).pose)[0] < 0.02
-    unsure = rooms.locate(rooms.scene(1)[1], featureless, replace(settings, gravity="unknown"))
-    assert rooms.errors(unsure.pose, rooms.query(1).pose)[0] < 0.02
-    assert unsure.evidence.num_matches > 40  # with the drawn scan
-    assert unsure.evidence.alternative_matches < 6

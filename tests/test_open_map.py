@@ -1,26 +1,20 @@
-"""Maps in the cache: made once, their features when they are needed; and what is known of files."""
+"""Maps in the cache: made once; and what is known of files."""
 
 import hashlib
 import os
 import resource
-import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-import rooms
 from refusals import assert_input_error, fill_disk
 from rooms import scan_map
 
 from piccolo.cloud.settings import BY_FILE
 from piccolo.files import cache
-from piccolo.jobs.threads import Once, Stopwatch, Workers
-from piccolo.localization.attempts import match_poses
-from piccolo.opening import Cloud, open_scan
-from piccolo.scan_map import map_file, open_map, scan_map as making
-from piccolo.scan_map.map_file import load_map, save_map
+from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.scan_map import map_file, open_map
+from piccolo.scan_map.map_file import save_map
 from piccolo.scan_map.open_map import CachePolicy
 
 TIER = "scene"
@@ -38,7 +32,7 @@ def _open(cloud, folder, monkeypatch, num_made=1):
     """The map by `open_map`, and the warnings; `prepare_map` is called so many times."""
     made, heard = [], []
 
-    def prepare(*_, prior, has_features):
+    def prepare(*_, prior):
         made.append(1)
         return scan_map(1)
 
@@ -221,95 +215,3 @@ def test_a_damaged_map_leaves_no_copy(facts, tmp_path):
     os.truncate(path, path.stat().st_size - 1)
     assert_input_error("damaged", map_file.load_map, path, remembers=True)
     assert not list((facts.parent / "maps").glob("*.piccolo-map"))
-
-
-WORKERS = Workers(2)
-
-
-@pytest.fixture
-def finding(monkeypatch):
-    """Counts how often features are looked for; they are those of the room."""
-    asked = []
-    found = scan_map(1).local_features
-    monkeypatch.setattr(making, "find_local_features", lambda *_: asked.append(1) or found)
-    return asked
-
-
-@pytest.fixture
-def opened(tmp_path):
-    cache = CachePolicy(folder=tmp_path / "cache")
-    cloud = rooms.write_cloud(tmp_path / "cloud.ply", 1)
-    return lambda: open_map.open_map([Path(cloud)], BY_FILE, cache, WORKERS, Stopwatch())
-
-
-def test_they_are_made_once_and_threads_wait_for_them():
-    made = []
-
-    def make(workers):
-        made.append(workers)
-        time.sleep(0.2)
-        return "features"
-
-    late = Once(make)
-    with ThreadPoolExecutor(3) as pool:
-        assert list(pool.map(late, [WORKERS] * 3)) == ["features"] * 3
-    assert made == [WORKERS]
-
-
-def test_the_cache_keeps_them_for_the_next_process(opened, finding):
-    first = opened()
-    assert first.lacks_features
-    first.features_now(WORKERS)
-    assert finding == [1]
-    other = opened()
-    assert not other.lacks_features
-    np.testing.assert_array_equal(other.features_now(WORKERS).points, first.features_now(WORKERS).points)
-    assert finding == [1]
-
-
-def test_looking_for_them_is_told_and_is_no_work_on_the_photo(opened, finding, caplog):
-    first = opened()
-    means = rooms.means()
-    problem = rooms.ask(rooms.scene(1)[1], first)
-    with caplog.at_level("INFO", "piccolo"):
-        poses, _ = match_poses(problem, means)
-    assert "tools/prepare_map.py" in caplog.text
-    assert not first.awaits_features
-    assert sorted(means.watch.seconds) == ["match", "prepare"]
-    again = rooms.means()
-    assert [p.key for p in match_poses(problem, again)[0]] == [p.key for p in poses]
-    assert list(again.watch.seconds) == ["match"]
-    assert finding == [1]
-
-
-def test_what_another_process_has_made_meanwhile_is_taken(opened, finding):
-    first, second = opened(), opened()
-    first.features_now(WORKERS)
-    second.features_now(WORKERS)
-    assert finding == [1]
-
-
-def test_where_they_can_not_be_kept_they_are_there_all_the_same(opened, finding, monkeypatch):
-    found = opened()
-    monkeypatch.setattr(open_map, "save_map", fill_disk)
-    assert len(found.features_now(WORKERS).points) > 1000
-    assert opened().lacks_features
-
-
-def test_a_map_file_without_them_makes_them_too(tmp_path, finding):
-    """As it is sent to the workers of a cluster."""
-    whole = scan_map(1)
-    none = making.make_feature_map(whole.octree, whole.centers[:0], WORKERS)
-    save_map(replace(whole, local_features=none), tmp_path / "a.map")
-    loaded = load_map(tmp_path / "a.map")
-    assert loaded.lacks_features
-    assert len(loaded.features_now(WORKERS).points) > 1000
-    assert finding == [1]
-
-
-def test_a_scan_of_arrays_is_opened_without_them(finding):
-    scan = open_scan(Cloud(rooms.points_world(1), colors=rooms.room(1)[1].colors), num_threads=2)
-    assert scan.prepared.lacks_features
-    assert finding == []
-    scan.localize(rooms.query(1).rgb, gravity="unknown")
-    assert finding == [1]

@@ -31,7 +31,6 @@ def _matches_of_wall(rng, count, noise, depth_noise):
         points=np.float32(points),
         tangents=np.float32(tangents @ TRUE.R_cam_from_world),
         sizes=np.float32(0.1 * ranges),
-        weights=np.ones(count, np.float32),
     )
 
 

@@ -65,9 +65,7 @@ def _in_gray(cloud):
 
 @functools.lru_cache
 def _shape_map():
-    made = prepare_map(
-        rooms.stream(_in_gray(rooms.room(SEED, NUM_POINTS)[1])), Workers(2), has_features=False
-    )
+    made = prepare_map(rooms.stream(_in_gray(rooms.room(SEED, NUM_POINTS)[1])), Workers(2))
     return replace(made, scan_sha256=64 * "0")
 
 
@@ -190,7 +188,7 @@ def test_intensity_is_a_channel_of_its_own():
     gray = np.repeat(cloud.colors.mean(axis=1).astype(np.uint8)[:, None], 3, axis=1)
     found = {}
     for name, made in (("shape", _in_gray(cloud)), ("intensity", replace(_in_gray(cloud), colors=gray))):
-        scan_map = prepare_map(rooms.stream(made), Workers(2), has_features=False)
+        scan_map = prepare_map(rooms.stream(made), Workers(2))
         assert scan_map.has_shape
         assert scan_map.has_intensity == (name == "intensity")
         settings = rooms.KNOWN
@@ -265,7 +263,7 @@ def test_a_photo_of_an_aisle_that_looks_as_the_one_scanned_is_ambiguous():
     """Taken between racks that no station saw. They are as those two metres beside, bay after bay."""
     world = World(RACKS, make_alike("racks", RACKS, 0.0))
     points = scan_world(world, 360_000, Workers(2))[0]
-    scan_map = prepare_map(stream_of_arrays(points.astype(float), None), Workers(2), has_features=False)
+    scan_map = prepare_map(stream_of_arrays(points.astype(float), None), Workers(2))
     taken = make_query(world, 0, "clean", WIDTH, Workers(2))
     found = rooms.locate(rooms.as_panorama(taken.rgb), scan_map, rooms.KNOWN)
     assert found.best_pose.distance(taken.pose) > AISLE - 0.1

@@ -117,7 +117,7 @@ def two_rooms():
     world = make_world(5, np.array(rooms.SIZE), 2)
     points, colors, _ = scan_world(world, 80_000, Workers(2))
     cloud = stream_of_arrays(points.astype(np.float64), colors)
-    return world, prepare_map(cloud, Workers(2), "z", has_features=False)
+    return world, prepare_map(cloud, Workers(2), "z")
 
 
 def test_nobody_walks_through_a_wall(two_rooms):

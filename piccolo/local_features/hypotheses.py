@@ -247,7 +247,7 @@ def propose_poses(matches: Matches, count: int, workers: Workers) -> list[Matche
 
     Poses with less than FAIR_PART of the best one's matches are left out.
     """
-    voters = np.arange(0, len(matches.query), 1 + (len(matches.query) - 1) // MAX_VOTERS)
+    voters = np.arange(0, len(matches.query), 1 + len(matches.query) // (MAX_VOTERS + 1))
     rotations = np.empty((len(voters), 3, 3))
     centers = np.empty((len(voters), 3))
     votes = np.empty(len(voters), np.int64)

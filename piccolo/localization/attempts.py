@@ -120,7 +120,8 @@ def search_features(problem: Problem, known: list[Candidate], means: Means) -> t
     found = known
     with means.watch.stage("match"):
         keypoints = find_all_around(problem.photo, workers)
-    left = places.list_allowed(problem.scan_map.centers[problem.scan_map.sparse])
+    likely = np.array([one.pose.center_world for one in known]).reshape(-1, 3)
+    left = places.choose(problem.scan_map.centers[problem.scan_map.sparse], likely)
     while len(left):
         part, left = left[:PLACES_AT_ONCE], left[PLACES_AT_ONCE:]
         with means.watch.stage("match"):

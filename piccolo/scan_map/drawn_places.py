@@ -15,7 +15,7 @@ from ..cloud.octree import Octree
 from ..geometry.pose import Pose
 from ..geometry.sphere import compute_indices, direction_to_pixel, find_cell, pixel_rays
 from ..geometry.vectors import minus, row
-from ..jobs.threads import Workers
+from ..jobs.threads import Once, Workers
 from ..kernels.jit import kernel, whole
 from ..local_features.keypoints import find_keypoints
 from ..local_features.matching import Located
@@ -35,7 +35,8 @@ STOREY_CELL = np.array([2.5, 2.5, 3.0])  # [m] around: a part of a storey
 TABLE_HEIGHT = 48  # rows of directions, 3.75 degrees each
 SLACK = 1.0  # [m] a wall is so much nearer than what is behind it
 ROOM = 64  # positions, at first
-MOST_PICTURES = 512  # that are kept, 0.3 GB
+MOST_PLACES = 512  # at which the scan is drawn for a photo
+MOST_PICTURES = 1024  # that are kept, 0.2 GB
 Look = Callable[[int], Array32]  # ranges (cells,) [m] seen from a candidate, 0 for nothing
 
 
@@ -45,27 +46,25 @@ class DrawnPlaces:
     def __init__(self, octree: Octree, candidates: Array) -> None:
         """Begin without pictures; `candidates` (N, 3) [m] are where a camera may be."""
         self.octree = octree
-        self.candidates = candidates
-        self._positions: Array | None = None
+        self._positions = Once(find_positions, octree, candidates)
         self._pictures: dict[int, Located] = {}
         self._lock = threading.Lock()
 
     @property
     def positions(self) -> Array:
         """Positions (P, 3) [m] of the pictures, in the map's frame."""
-        with self._lock:
-            if self._positions is None:
-                chosen = choose_positions(self.candidates, make_range_lookup(self.octree, self.candidates))
-                self._positions = self.candidates[chosen]
-            return self._positions
+        return self._positions()
 
-    def list_allowed(self, centers: Array) -> Int64s:
-        """Return the indices of the positions near any of centers (N, 3) [m], where a photo may be."""
+    def choose(self, allowed: Array, likely: Array) -> Int64s:
+        """Return the indices (n,) of at most MOST_PLACES positions near any of allowed centers (N, 3) [m].
+
+        If there are more, those nearest to likely centers (K, 3) are chosen.
+        """
         positions = self.positions
-        is_allowed = np.zeros(len(positions), np.bool_)
-        for center in centers:
-            is_allowed |= np.square(positions - center).sum(axis=1) < NEAR**2
-        return np.flatnonzero(is_allowed)
+        near = [k for k, one in enumerate(positions) if measure_nearest(one, allowed) < NEAR]
+        if len(near) > MOST_PLACES:
+            near.sort(key=lambda k: measure_nearest(positions[k], likely))
+        return np.array(near[:MOST_PLACES], np.int64)
 
     def draw(self, places: Sequence[int], workers: Workers) -> list[Located]:
         """Return the pictures at some of the positions."""
@@ -80,6 +79,11 @@ class DrawnPlaces:
             return [self._pictures[k] for k in places]
 
 
+def measure_nearest(position: Array, centers: Array) -> float:
+    """Return the distance [m] of a position (3,) from the nearest of centres (N, 3); without any infinity."""
+    return float(np.sqrt(np.square(centers - position).sum(axis=1).min(initial=np.inf)))
+
+
 def draw_around(octree: Octree, center_map: Array) -> Located:
     """Draw all that is seen from a centre (3,) [m]; return the keypoints whose rays meet the scan."""
     pose = Pose(np.eye(3), center_map)
@@ -90,9 +94,13 @@ def draw_around(octree: Octree, center_map: Array) -> Located:
     return Located(found.take(kept), ranges[kept], pose)
 
 
-def make_range_lookup(octree: Octree, centers: Array) -> Look:
-    """Return a function that maps an index of centres (N, 3) to the ranges seen from there."""
-    return lambda k: ranges_around(octree, centers[k : k + 1], SEARCH_VIEW)[0]
+def find_positions(octree: Octree, candidates: Array) -> Array:
+    """Return those of candidates (N, 3) [m] that together see all that a camera can see."""
+
+    def look(k: int) -> Array32:
+        return ranges_around(octree, candidates[k : k + 1], SEARCH_VIEW)[0]
+
+    return candidates[choose_positions(candidates, look)]
 
 
 @kernel
