@@ -96,7 +96,7 @@ class Scan:
         if not isinstance(self.prepared, ScanMap):
             raise InputError("save: found a scan of the preset paper, wanted one of the default method")
         check_output(Path(path))
-        write_map(self.prepared, Path(path), self.workers)
+        write_map(self.prepared, Path(path))
 
     def localize(
         self,

@@ -91,7 +91,7 @@ def test_pictures_are_drawn_once_and_the_same_bits_by_any_number_of_threads():
 
 
 def test_old_pictures_make_room(monkeypatch):
-    monkeypatch.setattr(drawn_places, "MOST_PICTURES", 2)
+    monkeypatch.setattr(drawn_places, "MOST_DRAWN_KEPT", 2)
     places = _places()
     first = places.draw([0], rooms.WORKERS)[0]
     assert places.draw([0, 1], rooms.WORKERS)[0] is first
@@ -109,7 +109,7 @@ def test_the_scan_is_drawn_where_a_photo_may_be_and_first_where_it_is_likely(mon
     assert places.choose(positions[:1] + 0.1, nowhere)[0] == 0
     assert len(places.choose(positions[:1] + 100.0, nowhere)) == 0
     assert len(places.choose(nowhere, nowhere)) == 0
-    monkeypatch.setattr(drawn_places, "MOST_PLACES", 2)
+    monkeypatch.setattr(drawn_places, "MOST_DRAWN", 2)
     for k in range(len(positions)):
         chosen = places.choose(positions, positions[k : k + 1]).tolist()
         assert chosen[0] == k

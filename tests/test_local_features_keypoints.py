@@ -11,7 +11,7 @@ from piccolo.geometry.pose import yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.local_features.keypoints import DESCRIPTOR_SIZE, find_keypoints, join_keypoints
-from piccolo.local_features.perspective_view import HALVES, VIEWS_DEG, cover_sphere
+from piccolo.local_features.perspective_view import VIEWS_DEG, cover_sphere
 
 WIDTH = rooms.WIDTH
 PIXEL = 2.0 * np.pi / WIDTH  # [rad]
@@ -76,21 +76,16 @@ def test_what_views_share_counts_once():
     assert not (is_alike & of_two_views).any()
 
 
-def test_halves_of_the_views_are_every_other_one_and_find_what_all_find():
+def test_parts_of_the_views_find_what_all_find():
     gray = _gray()
     whole = _found()
     is_valid = np.ones(gray.shape, bool)
-    assert sorted(HALVES[0] + HALVES[1]) == list(range(len(VIEWS_DEG)))
-    halves = [find_keypoints(gray, is_valid, [VIEWS[k] for k in half], Workers(2)) for half in HALVES]
+    halves = [find_keypoints(gray, is_valid, VIEWS[k::2], Workers(2)) for k in range(2)]
+    assert min(len(half.rays) for half in halves) > 0.3 * len(whole.rays)
     joined = join_keypoints(halves)
     by_ray = [np.lexsort((found.sizes, *found.rays.T)) for found in (joined, whole)]
     for own, other in zip(joined.take(by_ray[0]), whole.take(by_ray[1]), strict=True):
         np.testing.assert_array_equal(np.sort(own, axis=0), np.sort(other, axis=0))
-    middles = VIEWS[0].middles
-    for k in range(2):
-        assert len(halves[k].rays) > 0.3 * len(whole.rays)
-        cosine = middles[list(HALVES[k])] @ middles[list(HALVES[1 - k])].T
-        assert cosine.max(axis=0).min() > np.cos(np.radians(60.0))  # each has neighbours of the other
 
 
 def test_masked_areas_have_none():

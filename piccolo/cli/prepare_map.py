@@ -50,7 +50,7 @@ def main(arguments: Arguments) -> int:
         scan_map = open_map(arguments.cloud, cloud_settings, no_cache, workers, watch)
         if arguments.name is not None or not scan_map.scan_names:  # a map keeps its names
             scan_map = name_scan(scan_map, name)
-    write_map(scan_map, arguments.out, workers)
+    write_map(scan_map, arguments.out)
     report = {
         "map": str(arguments.out),
         "scans": scan_map.scan_names,

@@ -16,7 +16,7 @@ DELAY = 0.5  # seconds: what takes less needs no bar
 COUNTED = "{desc}: {percentage:3.0f} % |{bar:20}| {remaining} left"
 UNCOUNTED = "{desc}: {n_fmt} in {elapsed}"
 # of a map, when its scan has been read
-STEPS = {"find free space": 1, "render views": 2, "find features": 3, "sort features": 4}
+STEPS = {"find free space": 1, "render views": 2}
 LOG = logging.getLogger("piccolo")
 tqdm.monitor_interval = 0  # no thread of tqdm's own, which might not start, for bars that stand still
 

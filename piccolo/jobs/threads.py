@@ -157,11 +157,6 @@ class Once(Generic[Value]):
         self._lock = threading.Lock()
         self._value: Value
 
-    @property
-    def is_known(self) -> bool:
-        """True if it has been worked out."""
-        return self._function is None
-
     def __call__(self, *arguments: object) -> Value:
         """Return the function's value. What it raises is raised, and it is asked again by the next."""
         with self._lock:

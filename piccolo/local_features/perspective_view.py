@@ -20,7 +20,6 @@ NUM_SIDES = 4
 Image = TypeVar("Image", Bytes, Mask)
 # of the faces of a cube; nothing is seen in those at the poles, which bound the sides
 FACES_DEG = [*((90.0 * k, 0.0) for k in range(NUM_SIDES)), (0.0, 90.0), (0.0, -90.0)]
-HALVES = (0, 2, 4, 6, 8, 10, 12, 15, 17, 19), (1, 3, 5, 7, 9, 11, 13, 14, 16, 18)  # every other view
 STRETCH = 1.2  # tangent of the angle between the middle of a view around a photo and its edge, at most
 VIEW_AROUND = 0.07  # [rad] that such a view shows more than the photo
 MULTIPLE = 16  # [px] of the sides of such a view

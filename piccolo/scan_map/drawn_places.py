@@ -34,9 +34,9 @@ HEIGHT_STEP = 0.3  # [m]
 STOREY_CELL = np.array([2.5, 2.5, 3.0])  # [m] around: a part of a storey
 TABLE_HEIGHT = 48  # rows of directions, 3.75 degrees each
 SLACK = 1.0  # [m] a wall is so much nearer than what is behind it
-ROOM = 64  # positions, at first
-MOST_PLACES = 512  # at which the scan is drawn for a photo
-MOST_PICTURES = 1024  # that are kept, 0.2 GB
+FIRST_ROOM = 64  # positions, at first
+MOST_DRAWN = 512  # at which the scan is drawn for a photo
+MOST_DRAWN_KEPT = 1024  # that are kept, 0.2 GB
 Look = Callable[[int], Array32]  # ranges (cells,) [m] seen from a candidate, 0 for nothing
 
 
@@ -56,22 +56,22 @@ class DrawnPlaces:
         return self._positions()
 
     def choose(self, allowed: Array, likely: Array) -> Int64s:
-        """Return the indices (n,) of at most MOST_PLACES positions near any of allowed centers (N, 3) [m].
+        """Return the indices (n,) of at most MOST_DRAWN positions near any of allowed centers (N, 3) [m].
 
         If there are more, those nearest to likely centers (K, 3) are chosen.
         """
         positions = self.positions
         near = [k for k, one in enumerate(positions) if measure_nearest(one, allowed) < NEAR]
-        if len(near) > MOST_PLACES:
+        if len(near) > MOST_DRAWN:
             near.sort(key=lambda k: measure_nearest(positions[k], likely))
-        return np.array(near[:MOST_PLACES], np.int64)
+        return np.array(near[:MOST_DRAWN], np.int64)
 
     def draw(self, places: Sequence[int], workers: Workers) -> list[Located]:
         """Return the pictures at some of the positions."""
         positions = self.positions
         with self._lock:
             missing = [k for k in places if k not in self._pictures]
-            if len(self._pictures) + len(missing) > MOST_PICTURES:
+            if len(self._pictures) + len(missing) > MOST_DRAWN_KEPT:
                 self._pictures.clear()
                 missing = list(places)
             drawn = workers.map(lambda k: draw_around(self.octree, positions[k]), missing, "draw")
@@ -98,7 +98,8 @@ def find_positions(octree: Octree, candidates: Array) -> Array:
     """Return those of candidates (N, 3) [m] that together see all that a camera can see."""
 
     def look(k: int) -> Array32:
-        return ranges_around(octree, candidates[k : k + 1], SEARCH_VIEW)[0]
+        ranges: Array32 = ranges_around(octree, candidates[k : k + 1], SEARCH_VIEW)[0]
+        return ranges
 
     return candidates[choose_positions(candidates, look)]
 
@@ -151,8 +152,8 @@ def choose_positions(centers: Array, look: Look) -> Int64s:
     off = np.abs(centers[:, 2] - lowest[group.ravel()] - ABOVE_LOWEST)
     order = np.argsort(np.rint(off / HEIGHT_STEP), kind="stable")
     cells = cell_table(SEARCH_VIEW.num_rings)
-    kept = np.empty(ROOM, np.int64)
-    ranges = np.empty((ROOM, cells.max() + 1), np.float32)
+    kept = np.empty(FIRST_ROOM, np.int64)
+    ranges = np.empty((FIRST_ROOM, cells.max() + 1), np.float32)
     count = 0
     place = 0
     while (place := next_unseen(order, place, centers, kept[:count], ranges, cells)) < len(order):

@@ -79,7 +79,7 @@ def open_map(
     return replace(scan_map, warnings=(*scan_map.warnings, warning))
 
 
-def write_map(scan_map: ScanMap, path: Path, workers: Workers) -> None:
+def write_map(scan_map: ScanMap, path: Path) -> None:
     """Write a map; InputError if it covers only a part of a scan."""
     if scan_map.is_partial:
         raise InputError(f"{path}: found a map prepared within `near` only, wanted a whole map")

@@ -1,6 +1,5 @@
 """The map prepared once per cloud: octree, candidate camera positions, coarse views, names of its scans."""
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,7 +23,6 @@ from .camera_positions import COARSE_SPACING, Ball, TooManyPositionsError, candi
 from .drawn_places import DrawnPlaces
 from .storeys import Storeys, find_storeys
 
-LOG = logging.getLogger("piccolo")
 SHAPE_ALONE = "photos are localized by the shape of the scan, without colours"
 LEAST_DEVIATION = 0.004  # of luminance, by rounding colours to 8 bits
 MAX_TILT = np.radians(5.0)  # of the floors to the axis taken for up; a larger one is warned of

@@ -102,7 +102,7 @@ def open_desk(
     scan_map, _ = opened.require_default_method("the service", localizer.settings)
     end = ExitStack()
     folder = end.enter_context(temporary_folder())
-    write_map(scan_map, folder / MAP, workers)
+    write_map(scan_map, folder / MAP)
     localizer = replace(localizer, map_name=str(folder / MAP))
     site.begin_folder(folder)
     document = document_of_scan(scan_map, localizer.name, folder)
