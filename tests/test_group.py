@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 import rooms
 from groups import SEED, taken_photos
+from made_up import make_candidate
 
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian
 from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import NO_CANDIDATE
+from piccolo.judge.result import nothing_found
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.panorama import Panorama
 from piccolo.together import group
@@ -114,6 +117,30 @@ def test_places_are_compared_by_the_same_evidence():
     assert weights[2] == {1: weights[0][1]}
     assert weights[0][0] == pytest.approx(0.75, abs=0.02)
     assert [one.odds for one in tested[0].supports.values()] == [2.0, 100.0]
+
+
+def _support(x, odds):
+    """Evidence of a photo for a place at x [m]."""
+    return SUPPORT._replace(own=make_candidate(x, 0.5), odds=odds)
+
+
+@pytest.mark.parametrize(
+    ("elsewhere", "confidence"), [(_support(5.0, 80.0), 0.19), (_support(5.0, 19.0), 0.95), (None, 0.95)]
+)
+def test_a_photo_that_is_sure_is_doubted_where_it_explains_a_place_of_others_better(elsewhere, confidence):
+    """As another room of a hotel, of which it had found only a local optimum."""
+    alone = nothing_found().take_belief(make_belief([0.95]), 0.9)
+    here = make_candidate(0.0, 0.5).pose
+    member = SimpleNamespace(alone=alone, is_best=lambda pose: pose.distance(here) < 0.5)
+    told = [_support(0.1, 20.0), elsewhere]
+    tested = [group.Tested({}, {0: support} if support else {}) for support in told]
+    demand = rooms.KNOWN.demand
+    doubted = group.doubt_sure(group.Group(None, {0: member}), tested, demand)
+    assert doubted.get(0, alone).confidence == pytest.approx(confidence)
+    assert list(doubted) == ([0] if confidence < 0.9 else [])
+    assert group.doubt_sure(group.Group(None, {0: member}), tested[1:], demand) == {}, "its own is not tested"
+    assert group.list_sure(group.Group(None, {0: member}), tested[0]) == {0}
+    assert group.list_sure(group.Group(None, {0: member}), tested[1]) == set()
 
 
 def _gaussian(x, std):

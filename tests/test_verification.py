@@ -35,6 +35,9 @@ from piccolo.photo import Prior
 from piccolo.problem.method import METHOD
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.scan_map.scan_map import prepare_map
+from piccolo.together import bundle_search
+from piccolo.together.bundle_search import find_supports
+from piccolo.together.members import Member
 from piccolo.views.zbuffer import visible_points
 from research.synthetic.world import scan_world
 
@@ -140,6 +143,23 @@ def test_copies_are_looked_for_among_poses_that_could_win():
     workers, asked = rooms.listen()
     assert list_copies(problem.by_views(), found.candidates, 0, workers) == [False, False, False]
     assert asked == []
+
+
+def test_copies_of_a_place_that_others_propose_have_the_same_matches(monkeypatch):
+    """How many agree with each tells how well it was scanned, not which of them it is."""
+    problem = _beside_its_twin()
+    here = problem.scan_map.from_world(narrow_photo.take()[1])
+    twin = Pose(here.R_cam_from_world, here.center_world + APART)
+    own = examine(problem, here)
+    found = make_selection(replace(own, num_matches=40), replace(examine(problem, twin), num_matches=9))
+    alone = judge(Found(problem, found, None), rooms.means(), CoarseToFineSettings().demand)
+    member = Member(Found(problem, found, None), alone)
+    one, other = find_supports(member, problem, [here, twin], WORKERS)
+    assert one.odds > 1.0
+    assert 0.5 < one.odds / other.odds < 2.0
+    monkeypatch.setattr(bundle_search, "list_copies", lambda problem, ranked, *_: [False] * len(ranked))
+    one, other = find_supports(member, problem, [here, twin], WORKERS)
+    assert one.odds > 5.0 * other.odds
 
 
 @pytest.mark.parametrize("is_copy", [True, False])
