@@ -235,7 +235,7 @@ def test_progress_says_step_and_time_left(capsys, monkeypatch):
     is_terminal = True
     monkeypatch.setattr(sys.stderr, "isatty", lambda: is_terminal, raising=False)
     show = terminal.progress_bar(is_quiet=False)
-    for label, title in (("find features", "prepare, 3 of 4: find features: "), ("write", "write: ")):
+    for label, title in (("render views", "prepare, 2 of 2: render views: "), ("write", "write: ")):
         shown = show(iter([1, 2]), 2, label)
         next(shown)
         time.sleep(terminal.DELAY + 0.2)
