@@ -5,7 +5,7 @@ import re
 import pytest
 from dropping import FLAT, LISTEN, PHONE, answering, choose, giving, list_names, tell_place, wait_for
 
-from piccolo.result_files import read_results
+from piccolo.api.result_files import read_results
 
 # a file as a person drops it, put together in the page
 DROP = """([name, type, content]) => {

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from piccolo.api.result_files import read_results
 from piccolo.cli import report
 from piccolo.cloud.settings import BY_FILE
 from piccolo.jobs.threads import Workers
-from piccolo.result_files import read_results
 from piccolo.scan_map.open_map import open_points
 
 FIELD = 70.0  # [deg]

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from piccolo.api.result_files import read_results
 from piccolo.panorama.cameras import GUESS, HOW
 from piccolo.panorama.read import CHOICES
-from piccolo.result_files import read_results
 
 DOWNLOAD = "Download as a table (CSV)"
 # the names of all photos that the key n leads to

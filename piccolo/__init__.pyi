@@ -1,4 +1,7 @@
 # The public names: type checkers read them here, and at run time each is imported from here at its first use.
+from .api.opening import Cloud as Cloud, open_scan as open_scan
+from .api.scan import Scan as Scan
+from .api.scan_walk import Walk as Walk
 from .coloring.color_scan import Coloring as Coloring
 from .errors import InputError as InputError
 from .geometry.pose import Pose as Pose
@@ -13,14 +16,11 @@ from .judge.result_parts import (
     Source as Source,
     WalkFrame as WalkFrame,
 )
-from .opening import Cloud as Cloud, open_scan as open_scan
 from .paper.localize import PaperSettings as PaperSettings
 from .photo import GpsPrior as GpsPrior, Photo as Photo, Prior as Prior
 from .problem.accuracy import Accuracy as Accuracy
 from .problem.settings import CoarseToFineSettings as CoarseToFineSettings
 from .report.build import ReportSettings as ReportSettings, write_report as write_report
-from .scan import Scan as Scan
-from .scan_walk import Walk as Walk
 from .together.bundle_adjustment import RelativePoses as RelativePoses
 from .together.walk.frames import Motion as Motion
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from piccolo.api.scan import Scan
 from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.soa import pack_points
 from piccolo.cloud.stream import Cloud, stream_of_arrays
@@ -22,7 +23,6 @@ from piccolo.localization.means import Means, Trace
 from piccolo.panorama import Panorama
 from piccolo.problem.problem import prepare_problem
 from piccolo.problem.settings import CoarseToFineSettings
-from piccolo.scan import Scan
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.view import average_view, normalize_view

@@ -13,11 +13,11 @@ from typing import ClassVar
 import pytest
 from batches import PAPER, start_localize
 
+from piccolo.api.result_files import read_results
 from piccolo.batch import localizer as module
 from piccolo.batch.inputs import list_panoramas
 from piccolo.cli import localize, settings
 from piccolo.errors import InputError
-from piccolo.result_files import read_results
 from research.scene import read_scene
 
 TIER = "scene"

@@ -20,7 +20,11 @@ from pictures import encoded, write
 from poses import judged
 from results import PHONE
 
-from piccolo import open_scan, second_look
+from piccolo import open_scan
+from piccolo.api import second_look
+from piccolo.api.result_files import read_results
+from piccolo.api.scan import Scan
+from piccolo.api.second_look import Looking, Others
 from piccolo.batch.localizer import Localizer
 from piccolo.camera import Mount
 from piccolo.camera.calibration import document_of
@@ -34,9 +38,6 @@ from piccolo.judge.belief import make_belief
 from piccolo.judge.pose_covariance import describe_errors
 from piccolo.judge.result_parts import Beside
 from piccolo.photo import Photo
-from piccolo.result_files import read_results
-from piccolo.scan import Scan
-from piccolo.second_look import Looking, Others
 from piccolo.together.second_looks import Look
 from research.synthetic.world import render_picture
 

@@ -10,12 +10,12 @@ from refusals import assert_input_error
 from rooms import scan as scan_of_room
 
 import piccolo
+from piccolo.api.result_files import read_results
 from piccolo.cli.localize import main
 from piccolo.export.formats import export
 from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.photo import Photo
-from piccolo.result_files import read_results
 from research.scene import read_scene
 
 TIER = "scene"

@@ -9,13 +9,13 @@ import pytest
 from pictures import write
 from rooms import write_room
 
+from piccolo.api.result_files import read_results
 from piccolo.camera import Camera, Mount
 from piccolo.camera.calibration import document_of
 from piccolo.camera.model import pinhole
 from piccolo.cli import export_poses, localize, render_pose
 from piccolo.geometry.pose import exp_so3
 from piccolo.jobs.threads import Workers
-from piccolo.result_files import read_results
 from piccolo.views.pictures import cut, sphere_width_for
 from research.evaluation import evaluate
 from research.scene import read_scene

@@ -14,6 +14,7 @@ from plyfile import PlyData, PlyElement
 from refusals import assert_input_error
 from rooms import room
 
+from piccolo.api.opening import open_files
 from piccolo.cloud.readers.reader import PointSource, RawCloud
 from piccolo.cloud.settings import METRES, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.stream import CloudStream, open_cloud, stream_of_arrays
@@ -21,7 +22,6 @@ from piccolo.cloud.voxels import Voxels
 from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3, rotation_to_z
 from piccolo.jobs.threads import Stopwatch, Workers
-from piccolo.opening import open_files
 from piccolo.paper.localize import PaperSettings
 from piccolo.scan_map.open_map import CachePolicy, content_key, open_map
 from piccolo.scan_map.scan_map import prepare_map

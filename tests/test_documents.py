@@ -20,10 +20,10 @@ import pytest
 from batches import main_of
 
 import piccolo
+from piccolo.api.opening import Cloud
 from piccolo.cloud.stream import FORMATS
 from piccolo.export.formats import FORMATS as EXPORTS
 from piccolo.kernels.jit import COMPILE_TIME
-from piccolo.opening import Cloud
 from piccolo.photo import Photo, Prior
 from research.synthetic import make_room
 
@@ -214,7 +214,13 @@ def test_api_page(folder, monkeypatch):
     assert tried > 20
 
 
-PUBLIC = ["piccolo", "piccolo.opening", "piccolo.scan", "piccolo.report.build", "piccolo.geometry.pose"]
+PUBLIC = [
+    "piccolo",
+    "piccolo.api.opening",
+    "piccolo.api.scan",
+    "piccolo.report.build",
+    "piccolo.geometry.pose",
+]
 
 
 @pytest.mark.parametrize("name", PUBLIC)

@@ -14,6 +14,7 @@ from results import RESULT
 
 import piccolo
 from piccolo import Pose, Result
+from piccolo.api.result_files import read_results
 from piccolo.cli import localize as localize_command
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import check_pose, exp_so3
@@ -25,7 +26,6 @@ from piccolo.kernels.jit import whole
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama.texels import pack_texels
 from piccolo.photo import GpsPrior
-from piccolo.result_files import read_results
 from piccolo.views.zbuffer import nearest_depth, render_view, visible_points
 
 TIER = "scene"

@@ -13,12 +13,12 @@ from PIL import Image
 from poses import CENTER, SIZE, jpeg, lines_of, result, tilted_poses, write_results
 from refusals import mutated, read_or_refused
 
+from piccolo.api.result_files import read_results
 from piccolo.cli import export_poses
 from piccolo.errors import InputError
 from piccolo.export.formats import FORMATS
 from piccolo.export.posed_images import select
 from piccolo.judge.result_parts import Source
-from piccolo.result_files import read_results
 from research.datasets.generic import _table
 
 POSES = tilted_poses(5)

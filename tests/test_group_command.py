@@ -11,11 +11,11 @@ from groups import SEED, taken_photos
 from pictures import encoded, write
 from services import serving
 
+from piccolo.api.result_files import read_results
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli.localize import main
 from piccolo.panorama.video import choose_distinct
-from piccolo.result_files import read_results
 from research.synthetic.walk_frames import writing_video
 from research.synthetic.world import render_picture
 

@@ -25,18 +25,8 @@ LAYERS = [
     "report",
     "export",
     "batch",
-    "opening",
-    "scan",
-    "scan_walk",
-    "scan_coloring",
-    "second_look",
-    "scan_group",
-    "scan_bundle",
-    "scan_photo",
-    "photo_reader",
+    "api",
     "coloring",
-    "result_photo",
-    "result_files",
     "together",
     "localization",
     "paper",
@@ -146,7 +136,7 @@ def test_one_module_makes_statuses():
 
     assert find_callers("classify") == {"judge/belief.py"}
     assert find_callers("decide") == {"judge/result.py"}
-    results = [node for path, node in calls if node.func.id == "Result" and path != "photo_reader.py"]
+    results = [node for path, node in calls if node.func.id == "Result" and path != "api/photo_reader.py"]
     assert len(results) > 2
     assert not any(node.args or "status" in [k.arg for k in node.keywords] for node in results)
 

@@ -13,6 +13,7 @@ from pictures import encoded, write
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
+from piccolo.api.result_files import read_results
 from piccolo.camera import Mount
 from piccolo.camera.calibration import document_of, read_rig
 from piccolo.camera.model import Camera, pinhole
@@ -22,7 +23,6 @@ from piccolo.jobs.threads import Workers
 from piccolo.judge.result import Result
 from piccolo.panorama import read_panorama
 from piccolo.photo import Photo
-from piccolo.result_files import read_results
 from research.synthetic.world import photograph, picture_of_all, render_picture
 
 TIER = "scene"

@@ -20,6 +20,7 @@ from batches import ROOT, main_of
 from e57_files import ImageToWrite, ScanToWrite
 from poses import result, write_results
 
+from piccolo.api.result_files import read_results
 from piccolo.cli.command import new_parser, parse
 from piccolo.cloud.readers.e57 import list_images
 from piccolo.cloud.writers import vertex_rows
@@ -27,7 +28,6 @@ from piccolo.export.formats import export, tum_lines
 from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.judge.pose_covariance import PoseCovariance
-from piccolo.result_files import read_results
 
 TIER = "scene"
 

@@ -9,12 +9,12 @@ import pytest
 from refusals import assert_input_error
 from results import ALTERNATIVE, POSE, RESULT
 
+from piccolo.api.photo_reader import unreadable_result
+from piccolo.api.result_files import read_results
 from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result
 from piccolo.judge.result_parts import Source
-from piccolo.photo_reader import unreadable_result
 from piccolo.report.site import NOT_TOLD
-from piccolo.result_files import read_results
 
 ROOT = Path(__file__).resolve().parents[1]
 WITHOUT_ARRAYS = {"status": "not_localized", "best_pose": None, "alternatives": (), "covariance": None}

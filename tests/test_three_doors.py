@@ -12,6 +12,7 @@ from poses import result
 from services import serving
 
 import piccolo
+from piccolo.api.result_files import read_results
 from piccolo.batch.relative_poses import read_relative_poses
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
@@ -20,7 +21,6 @@ from piccolo.export.formats import export
 from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
-from piccolo.result_files import read_results
 from research.synthetic.world import render_picture
 
 TIER = "scene"

@@ -11,6 +11,8 @@ import rooms
 from batches import untimed
 from walks import SEED, assert_right, list_frames, run_localize, write_walk
 
+from piccolo.api.result_files import read_results
+from piccolo.api.scan_walk import Walk
 from piccolo.batch.jobs import steps_file
 from piccolo.cli import localize
 from piccolo.errors import InputError
@@ -18,8 +20,6 @@ from piccolo.export.formats import tum_lines
 from piccolo.geometry.pose import Pose, carry, yaw_rotation
 from piccolo.jobs import memory
 from piccolo.panorama import picture
-from piccolo.result_files import read_results
-from piccolo.scan_walk import Walk
 from research.synthetic.walk_frames import writing_video
 
 TIER = "scene"

@@ -11,6 +11,11 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..api.result_files import read_results
+from ..api.scan import Scan
+from ..api.scan_bundle import AskedPosed, localize_posed
+from ..api.scan_group import OF_RESULTS, AskedTogether, localize_photos_together
+from ..api.scan_walk import Walk
 from ..coloring import color_scan
 from ..errors import InputError
 from ..files.atomic import STDOUT, is_stream, write_lines
@@ -24,12 +29,7 @@ from ..localization.means import Step, Trace
 from ..panorama.photo import sha256_of
 from ..photo import Photo
 from ..problem.settings import CoarseToFineSettings
-from ..result_files import read_results
-from ..scan import Scan
-from ..scan_bundle import AskedPosed, localize_posed
-from ..scan_group import OF_RESULTS, AskedTogether, localize_photos_together
 from ..scan_map.scan_map import ScanMap
-from ..scan_walk import Walk
 from .localizer import Localizer, rename
 from .relative_poses import find_scale, read_relative_poses
 from .results_file import WAYS, Records

@@ -9,6 +9,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .. import __version__
+from ..api.opening import open_files
+from ..api.photo_reader import Settings, settings_json, unreadable_result
+from ..api.scan import Scan
+from ..api.scan_group import AskedTogether, localize_photos_together
+from ..api.scan_photo import Asked
+from ..api.second_look import Others
 from ..camera import Calibration
 from ..cloud.settings import CloudSettings
 from ..files.atomic import temporary_folder, write_temporary
@@ -20,16 +26,10 @@ from ..jobs.threads import Workers
 from ..judge.result import Result
 from ..judge.result_parts import Source
 from ..localization.means import Step, Trace
-from ..opening import open_files
 from ..photo import Photo, Vector
-from ..photo_reader import Settings, settings_json, unreadable_result
 from ..problem.settings import CoarseToFineSettings
-from ..scan import Scan
-from ..scan_group import AskedTogether, localize_photos_together
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
-from ..scan_photo import Asked
-from ..second_look import Others
 from ..together.second_looks import Look, localize_in_order
 from ..views.pictures import encode_image, overlay_png
 from .inputs import PriorTable

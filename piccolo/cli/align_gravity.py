@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..api.scan import Scan
 from ..arrays import Array
 from ..cloud.octree import build_octree
 from ..cloud.settings import CloudSettings, R_z_from_axis
@@ -17,7 +18,6 @@ from ..jobs.threads import Workers, num_cores
 from ..judge.probability import LOCALIZED
 from ..panorama import read_panorama
 from ..problem.settings import CoarseToFineSettings
-from ..scan import Scan
 from ..scan_map.scan_map import prepare_map
 from .command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from .options import add_cloud_options

@@ -4,10 +4,10 @@ from argparse import ArgumentParser
 
 import numpy as np
 
+from ..api.result_files import read_results
 from ..export.model_alignment import file_of_poses, fit_alignment, write_aligned, write_matrix
 from ..files.atomic import check_output, check_output_folder
 from ..geometry.pose import quaternion_wxyz
-from ..result_files import read_results
 from .command import Arguments, check_distinct, command, option
 
 EPILOG = """\

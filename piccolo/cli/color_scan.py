@@ -2,10 +2,10 @@
 
 from argparse import ArgumentParser
 
+from ..api.opening import open_files
+from ..api.result_files import read_results
 from ..coloring.color_scan import check_suffix, write_colored_scan
-from ..opening import open_files
 from ..problem.settings import CoarseToFineSettings
-from ..result_files import read_results
 from ..scan_map.scan_map import ScanMap
 from .command import Arguments, check_outputs, checking_options, command, option
 from .options import CACHE_TEXT, add_cloud_options

@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 
 from tqdm import tqdm
 
+from ..api.scan import Scan
 from ..batch.answering import Executor
 from ..batch.localizer import Localizer
 from ..errors import InputError, printable
@@ -21,7 +22,6 @@ from ..jobs.threads import num_cores
 from ..judge.probability import AMBIGUOUS, LOCALIZED
 from ..judge.result import FAILED, UNREADABLE, Result
 from ..judge.sure import WORTH_A_LOOK
-from ..scan import Scan
 from ..scan_map.map_file import save_map
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.scan_map import ScanMap

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ..api.result_files import check_scan, read_results
 from ..errors import InputError
 from ..export.faces import FACES
 from ..export.formats import FORMATS, export
@@ -14,7 +15,6 @@ from ..export.reconstructions import points_file
 from ..export.scan_points import open_scan_of
 from ..geometry.pose import CAMERA_AXES
 from ..judge.result import Result
-from ..result_files import check_scan, read_results
 from ..scan_map.open_map import CachePolicy, scan_sha256_of
 from .command import Arguments, check_distinct, checking_options, command, option
 

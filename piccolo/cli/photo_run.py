@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ..api.scan import Scan
 from ..arguments import PICTURES
 from ..batch.answering import Answering
 from ..batch.inputs import describe_left_out, is_from_stdin, list_panoramas, read_priors
@@ -34,7 +35,6 @@ from ..panorama.masks import find_mask
 from ..panorama.photo import sha256_of
 from ..photo import Photo
 from ..problem.settings import CoarseToFineSettings
-from ..scan import Scan
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
 from ..together.second_looks import LISTINGS, Change, follow_cameras

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..api.result_files import read_results
 from ..arrays import Array32
 from ..camera import Camera, Mount
 from ..camera.calibration import read_calibration
@@ -17,7 +18,6 @@ from ..files.atomic import check_output, check_output_folder, is_stream, replaci
 from ..files.json_file import read_text
 from ..geometry.pose import CAMERA_AXES, Pose, R_cam_from_angles, check_pose, check_transform
 from ..jobs.threads import Workers
-from ..result_files import read_results
 from ..scan_map.open_map import open_points
 from ..views.pictures import cut_view, encode_image, fill_holes, sphere_width_for
 from ..views.surfels import render_points

@@ -5,16 +5,16 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
+from ..api.photo_reader import Settings
+from ..api.scan import ONLY_DEFAULT
 from ..batch.localizer import Localizer
 from ..cloud.settings import CloudSettings
 from ..errors import InputError
 from ..panorama import check_labels
 from ..paper.localize import PaperSettings
 from ..photo import NOTHING_KNOWN, Photo, Prior
-from ..photo_reader import Settings
 from ..problem.accuracy import Accuracy
 from ..problem.settings import CoarseToFineSettings
-from ..scan import ONLY_DEFAULT
 from ..scan_map.open_map import CachePolicy
 from .command import Arguments
 from .options import NONE

@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+from ..api.scan import Scan
+from ..api.scan_walk import Walk
 from ..batch.inputs import is_from_stdin, times_of
 from ..batch.jobs import (
     Job,
@@ -31,8 +33,6 @@ from ..judge.result import Result
 from ..panorama.photo import sha256_of
 from ..panorama.video import choose_distinct, frames_of_chapters
 from ..photo import Photo
-from ..scan import Scan
-from ..scan_walk import Walk
 from ..together.series import MOST_IN_SERIES
 from ..together.walk.frames import Motion
 from . import terminal

@@ -24,9 +24,9 @@ from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
 from ..judge.result import FAILED, Result
 from ..kernels.jit import F0, HALF, kernel
+from ..localization.result_photo import read_as_localized
 from ..panorama import Panorama, texels
 from ..panorama.model import shrink
-from ..result_photo import read_as_localized
 from ..scan_map.open_map import find_prepared_map
 from ..scan_map.scan_map import SHAPE_ALONE, ScanMap, change_colors
 from .alignment import Anchor, Sight, align, look, weigh_points

@@ -15,9 +15,9 @@ from ..files.atomic import write_atomically
 from ..files.json_file import read_bytes
 from ..geometry.pose import R_cam_from_angles
 from ..geometry.sphere import compute_pixels
+from ..localization.result_photo import read_as_localized
 from ..panorama import Panorama
 from ..panorama.picture import WANTED
-from ..result_photo import read_as_localized
 from ..views.pictures import encode_image, sample_sphere
 from .posed_images import PosedImage, names_within
 

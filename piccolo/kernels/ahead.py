@@ -26,7 +26,7 @@ from . import jit
 
 LISTED = Path(__file__).with_name("signatures.txt")
 PACKAGES = Path(__file__).parents[2]  # from which a process imports this one
-IMPORTS = "piccolo.scan"  # imports all of them
+IMPORTS = "piccolo.api.scan"  # imports all of them
 TOKEN = re.compile(r"[\w.]*\(|\)|[\w.]+(?:\[\w+\])?")
 TYPES: Any = types  # Numba gives them none
 HELPS = "helps"  # argument of a process that helps

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import __version__
+from ..api.result_files import check_scan
+from ..api.scan import Scan
 from ..arguments import check_fields, check_kind
 from ..errors import InputError
 from ..files.atomic import temporary_folder, write_atomically
@@ -19,8 +21,6 @@ from ..geometry.pose import Pose
 from ..jobs.threads import Workers
 from ..judge.result import FAILED, UNREADABLE, Result
 from ..photo import File
-from ..result_files import check_scan
-from ..scan import Scan
 from ..scan_map.scan_map import ScanMap
 from ..views.pictures import encode_image
 from ..views.surfels import MAX_SURFELS, Surfels, make_surfels

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..judge.result import Result
+from ..localization.result_photo import photo_of
 from ..panorama.photo import sha256_of
-from ..result_photo import photo_of
 from .pictures import FRAME
 
 

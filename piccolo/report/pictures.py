@@ -33,11 +33,11 @@ from ..geometry.pose import Pose, yaw_rotation
 from ..jobs.threads import Workers
 from ..judge.probability import AMBIGUOUS
 from ..judge.result import Result
+from ..localization.result_photo import labels_of, photo_of
 from ..panorama import Panorama, read_panorama
 from ..panorama.model import shrink
 from ..panorama.picture import read_picture
 from ..panorama.video import frames_at
-from ..result_photo import labels_of, photo_of
 from ..scan_map.scan_map import ScanMap
 from ..views.pictures import cut, encode_image, fill_holes
 from ..views.surfels import Surfels, render_surfels, visible_indices

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..api.result_files import read_results
 from ..arrays import Array
 from ..errors import printable
 from ..files.atomic import check_output_folder, write_atomically
@@ -28,7 +29,6 @@ from ..judge.probability import NOT_LOCALIZED
 from ..judge.reasons import Reason
 from ..judge.result import FAILED, UNREADABLE, Result
 from ..judge.sure import SHOWN
-from ..result_files import read_results
 from ..scan_map.scan_map import ScanMap
 
 INDEX = "index.html"

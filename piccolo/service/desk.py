@@ -12,6 +12,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..api.scan import Scan
 from ..batch.localizer import Localizer, Task
 from ..errors import InputError
 from ..files.atomic import temporary_folder
@@ -22,7 +23,6 @@ from ..panorama.picture import open_picture
 from ..report import site
 from ..report.build import WIDTH, document_of_scan, list_poses
 from ..report.pictures import make_pictures
-from ..scan import Scan
 from ..scan_map.open_map import write_map
 from ..scan_map.scan_map import ScanMap
 from ..views.surfels import MAX_SURFELS, make_surfels

@@ -15,8 +15,8 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from ..api.photo_reader import describe_failure
 from ..errors import ResourceError, printable
-from ..photo_reader import describe_failure
 from .access import LOOPBACK, Access
 
 LOG = logging.getLogger(__name__)

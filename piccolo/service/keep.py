@@ -9,11 +9,11 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
+from ..api.result_files import read_results
 from ..files.atomic import write_atomically
 from ..files.line_file import LineFile, open_locked, whole_size
 from ..judge.result import Result
 from ..report import site
-from ..result_files import read_results
 from ..scan_map.scan_map import ScanMap
 
 RESULTS = "results.jsonl"

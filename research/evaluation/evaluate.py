@@ -11,6 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from piccolo.api.photo_reader import Settings, describe_failure, settings_json
+from piccolo.api.result_files import check_scan, read_results
+from piccolo.api.scan import Scan
 from piccolo.batch.answering import Answering
 from piccolo.batch.localizer import Localizer
 from piccolo.cli import execution, options, settings as cli_settings
@@ -33,11 +36,8 @@ from piccolo.jobs.interruption import Interruption, interruptible
 from piccolo.jobs.memory import limit_memory
 from piccolo.jobs.threads import Workers
 from piccolo.judge.result import UNREADABLE
-from piccolo.photo_reader import Settings, describe_failure, settings_json
 from piccolo.problem.accuracy import PAPER_ACCURACY
 from piccolo.problem.settings import CoarseToFineSettings
-from piccolo.result_files import check_scan, read_results
-from piccolo.scan import Scan
 from piccolo.scan_map.open_map import scan_sha256_of
 
 from ..scene import Query, Scene, find_scenes, input_files

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from piccolo.api.scan import Scan
 from piccolo.arrays import Array
 from piccolo.batch.results_file import check_as_expected
 from piccolo.errors import InputError, printable
@@ -18,7 +19,6 @@ from piccolo.files.line_file import whole_size
 from piccolo.geometry.pose import MAX_ANGLE, MAX_DISTANCE, Pose, pose_errors
 from piccolo.judge.probability import LOCALIZED
 from piccolo.judge.result import Result
-from piccolo.scan import Scan
 
 from ..scene import Query, Scene, document_of_pose, pose_of
 

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from piccolo import InputError, Pose
+from piccolo.api.result_files import read_results
 from piccolo.arrays import Array, Int64s, Mask
 from piccolo.cli.command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from piccolo.cli.options import add_cloud_options
@@ -29,7 +30,6 @@ from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import read_panorama
 from piccolo.panorama.model import shrink
 from piccolo.panorama.texels import Texels, pack_texels
-from piccolo.result_files import read_results
 from piccolo.scan_map.open_map import open_points
 from piccolo.views.zbuffer import is_free_space, visible_points
 

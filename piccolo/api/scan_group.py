@@ -4,20 +4,20 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from .jobs.threads import Stopwatch, Workers
-from .judge.result import Result
-from .judge.result_parts import Beside
-from .localization.means import NO_TRACE, Trace
-from .localization.places import add_places
-from .panorama import Panorama
-from .panorama.photo import PhotoFacts
-from .photo import Photo
+from ..jobs.threads import Stopwatch, Workers
+from ..judge.result import Result
+from ..judge.result_parts import Beside
+from ..localization.means import NO_TRACE, Trace
+from ..localization.places import add_places
+from ..panorama import Panorama
+from ..panorama.photo import PhotoFacts
+from ..photo import Photo
+from ..problem.settings import CoarseToFineSettings
+from ..scan_map.scan_map import ScanMap
+from ..together.group import localize_group
+from ..together.members import Shot, check_photos
+from ..together.second_looks import digest_of
 from .photo_reader import PhotoReader
-from .problem.settings import CoarseToFineSettings
-from .scan_map.scan_map import ScanMap
-from .together.group import localize_group
-from .together.members import Shot, check_photos
-from .together.second_looks import digest_of
 
 OF_RESULTS = {"together": True}  # in their settings
 

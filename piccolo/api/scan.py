@@ -7,36 +7,36 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any
 
-from .arguments import check_kind, check_one_each
-from .arrays import Bytes, Floats
-from .cloud.settings import CloudSettings
-from .cloud.soa import PackedPoints
-from .coloring.color_scan import Coloring
-from .errors import InputError
-from .evidence.occlusion import occlusion_mask
-from .files.atomic import check_output
-from .geometry.pose import Gravity, Pose, check_pose
-from .jobs.threads import Workers
-from .judge.result import Result
-from .judge.result_parts import FocalLength
-from .localization.means import NO_TRACE, Trace
-from .paper.localize import PaperMap
-from .photo import File, Photo, Prior, as_photo
+from ..arguments import check_kind, check_one_each
+from ..arrays import Bytes, Floats
+from ..cloud.settings import CloudSettings
+from ..cloud.soa import PackedPoints
+from ..coloring.color_scan import Coloring
+from ..errors import InputError
+from ..evidence.occlusion import occlusion_mask
+from ..files.atomic import check_output
+from ..geometry.pose import Gravity, Pose, check_pose
+from ..jobs.threads import Workers
+from ..judge.result import Result
+from ..judge.result_parts import FocalLength
+from ..localization.means import NO_TRACE, Trace
+from ..paper.localize import PaperMap
+from ..photo import File, Photo, Prior, as_photo
+from ..problem.accuracy import Accuracy
+from ..problem.settings import CoarseToFineSettings
+from ..scan_map.open_map import write_map
+from ..scan_map.scan_map import ScanMap, check_within
+from ..together.bundle_adjustment import RelativePoses
+from ..together.second_looks import Look, localize_in_order
+from ..together.walk.frames import Motion
+from ..together.walk.tracker import Tracker
 from .photo_reader import PhotoReader, Settings
-from .problem.accuracy import Accuracy
-from .problem.settings import CoarseToFineSettings
 from .scan_bundle import AskedPosed, localize_posed
 from .scan_coloring import color_by
 from .scan_group import AskedTogether, localize_photos_together
-from .scan_map.open_map import write_map
-from .scan_map.scan_map import ScanMap, check_within
 from .scan_photo import Asked, localize_photo
 from .scan_walk import Walk
 from .second_look import Looking, Others
-from .together.bundle_adjustment import RelativePoses
-from .together.second_looks import Look, localize_in_order
-from .together.walk.frames import Motion
-from .together.walk.tracker import Tracker
 
 OPTIONS = "prior", "gravity", "accuracy", "min_confidence"  # of photos
 ONLY_DEFAULT = ("refine_focal", "gravity_vector")  # options of photos that the preset paper does not have

@@ -1,0 +1,1 @@
+"""The library that a program calls: a scan that is opened, and what is asked of it."""
