@@ -33,7 +33,7 @@ from .search import search_poses
 FIRST_BEAM = Beam(100, 12, 4, 1)
 FIRST_ROTATIONS = 1000  # of SO(3)
 FEW_CELLS = 200  # of the grid; if a prior leaves fewer, all of them are searched
-PLACES_AT_ONCE = 64  # at which the scan is drawn
+PLACES_AT_ONCE = 32  # at which the scan is drawn
 COS_TILT = math.cos(math.radians(12.0))  # most angle between their vertical and a known one
 
 
