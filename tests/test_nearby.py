@@ -51,7 +51,8 @@ def test_a_place_where_the_others_were_taken_is_not_elsewhere():
     """A photo was found there alone, but is not sure; another of its places is far away."""
     scan_map = rooms.scan_map(SEED)
     center = scan_map.centers[scan_map.sparse[0]]
-    here, far = (scan_map.to_world(Pose(np.eye(3), center + x)) for x in (0.5, 50.0))
+    here = scan_map.to_world(Pose(np.eye(3), center + 0.5))
+    far = scan_map.to_world(Pose(np.eye(3), center + 50.0))
     alone = replace(
         nothing_found(),
         best_pose=here,

@@ -33,7 +33,7 @@ from .search import search_poses
 FIRST_BEAM = Beam(100, 12, 4, 1)
 FIRST_ROTATIONS = 1000  # of SO(3)
 FEW_CELLS = 200  # of the grid; if a prior leaves fewer, all of them are searched
-PLACES_AT_ONCE = 32  # at which the scan is drawn
+PLACES_AT_ONCE = 32  # at which the scan is drawn before poses are proposed
 COS_TILT = math.cos(math.radians(12.0))  # most angle between their vertical and a known one
 
 
@@ -121,14 +121,15 @@ def search_features(problem: Problem, known: list[Candidate], means: Means) -> t
     with means.watch.stage("match"):
         keypoints = find_all_around(problem.photo, workers)
     likely = np.array([one.pose.center_world for one in known]).reshape(-1, 3)
-    left = places.choose(problem.scan_map.centers[problem.scan_map.sparse], likely)
-    while len(left):
-        part, left = left[:PLACES_AT_ONCE], left[PLACES_AT_ONCE:]
+    asked = places.choose(problem.scan_map.centers[problem.scan_map.sparse], likely)
+    for begin in range(0, len(asked), PLACES_AT_ONCE):
+        end = begin + PLACES_AT_ONCE
         with means.watch.stage("match"):
-            pictures = places.draw(part.tolist(), workers)
+            pictures = places.draw(asked[begin:end].tolist(), workers)
             matched += workers.map(partial(match_located, keypoints), pictures, "match")
             poses = propose_level(problem, merge_matches(matched), workers)
-            if len(left) and (not poses or poses[0].num_matches < problem.method.enough_matches):
+            is_last = end >= len(asked)
+            if not is_last and (not poses or poses[0].num_matches < problem.method.enough_matches):
                 continue
             refined = refine_matches(problem, [one.pose for one in poses], workers)
             found, is_enough = end_search(problem, known + add_verified(problem, refined, workers), workers)

@@ -1,7 +1,7 @@
 """Pictures of the scan from few positions that together see all of it, each drawn when it is asked for.
 
-Where a photo shows most of a place, views find its pose. Of one whose tilt is not known, or that people hide,
-they tell some places where it may have been taken; local features tell which, and the pose there.
+Where a photo shows most of a place, views find its pose. Of one whose tilt is not known, or that people
+hide, they do not tell the place; its local features do, matched with those of the pictures.
 """
 
 import threading
@@ -80,7 +80,7 @@ class DrawnPlaces:
 
 
 def measure_nearest(position: Array, centers: Array) -> float:
-    """Return the distance [m] of a position (3,) from the nearest of centres (N, 3); without any infinity."""
+    """Return the distance [m] of a position (3,) from the nearest of centres (N, 3); infinity if there is none."""
     return float(np.sqrt(np.square(centers - position).sum(axis=1).min(initial=np.inf)))
 
 
