@@ -80,7 +80,7 @@ class DrawnPlaces:
 
 
 def measure_nearest(position: Array, centers: Array) -> float:
-    """Return the distance [m] of a position (3,) from the nearest of centres (N, 3); infinity if there is none."""
+    """Return the distance [m] of a position (3,) from the nearest of centres (N, 3); infinity without any."""
     return float(np.sqrt(np.square(centers - position).sum(axis=1).min(initial=np.inf)))
 
 
