@@ -17,7 +17,8 @@ from dropping import FLAT, SLOW_MS, serving  # noqa: E402
 from report_scenes import HOSTILE, House, mixed_house  # noqa: E402
 from services import Client  # noqa: E402
 
-from piccolo.cli import localize, report  # noqa: E402
+from piccolo.apps.report import report  # noqa: E402
+from piccolo.cli import localize  # noqa: E402
 from piccolo.judge.result_parts import Source  # noqa: E402
 from research.synthetic import make_room  # noqa: E402
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from piccolo.api.result_files import read_results
-from piccolo.cli import report
+from piccolo.apps.report import report
 from piccolo.cloud.settings import BY_FILE
 from piccolo.jobs.threads import Workers
 from piccolo.scan_map.open_map import open_points

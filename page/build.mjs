@@ -1,9 +1,9 @@
-// Bundles the page into ../piccolo/report/page; with --check, fails if what is there differs from the sources.
+// Bundles the page into ../piccolo/apps/report/page; with --check, fails if what is there differs from the sources.
 import { build } from "esbuild";
 import { readFileSync, writeFileSync } from "node:fs";
 import { fileURLToPath } from "node:url";
 
-const out = new URL("../piccolo/report/page/", import.meta.url);
+const out = new URL("../piccolo/apps/report/page/", import.meta.url);
 
 const made = await build({
   absWorkingDir: fileURLToPath(new URL(".", import.meta.url)),

@@ -2,7 +2,7 @@
 from .api.opening import Cloud as Cloud, open_scan as open_scan
 from .api.scan import Scan as Scan
 from .api.scan_walk import Walk as Walk
-from .coloring.color_scan import Coloring as Coloring
+from .apps.report.build import ReportSettings as ReportSettings, write_report as write_report
 from .errors import InputError as InputError
 from .geometry.pose import Pose as Pose
 from .judge.pose_covariance import PoseCovariance as PoseCovariance
@@ -20,8 +20,8 @@ from .paper.localize import PaperSettings as PaperSettings
 from .photo import GpsPrior as GpsPrior, Photo as Photo, Prior as Prior
 from .problem.accuracy import Accuracy as Accuracy
 from .problem.settings import CoarseToFineSettings as CoarseToFineSettings
-from .report.build import ReportSettings as ReportSettings, write_report as write_report
 from .together.bundle_adjustment import RelativePoses as RelativePoses
+from .together.coloring.color_scan import Coloring as Coloring
 from .together.walk.frames import Motion as Motion
 
 __version__: str

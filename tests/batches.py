@@ -9,6 +9,8 @@ import time
 from importlib import import_module
 from pathlib import Path
 
+from piccolo.doors import COMMANDS
+
 ROOT = Path(__file__).resolve().parents[1]
 PAPER = ["--preset", "paper", "num_translations=4", "num_iterations=5", "max_points=5000"]
 
@@ -21,7 +23,7 @@ COARSE = {
 COARSELY = f"""
 import sys
 from piccolo.cli.localize import main
-from piccolo.coloring import alignment, passersby
+from piccolo.together.coloring import alignment, passersby
 vars(alignment).update({COARSE["alignment"]})
 vars(passersby).update({COARSE["passersby"]})
 sys.exit(main(sys.argv[1:]))
@@ -83,4 +85,4 @@ def work():
     for line in WORK:
         name, *words = line.split()
         with contextlib.redirect_stdout(io.StringIO()):
-            assert import_module(f"piccolo.cli.{name}").main([*words, "--quiet"]) == 0, line
+            assert import_module(COMMANDS[name]).main([*words, "--quiet"]) == 0, line

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from piccolo.api.photo_reader import unreadable_result
-from piccolo.cli import report
+from piccolo.apps.report import report
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief

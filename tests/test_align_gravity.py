@@ -15,7 +15,7 @@ from rooms import query as read_photo_facts
 from scans import bare_room, points_of, scan, write_scan
 from text_files import scan as ptx_lines, write_lines
 
-from piccolo.cli import align_gravity
+from piccolo.apps import align_gravity
 from piccolo.geometry.pose import exp_so3, transform_points
 from research.datasets import true_poses
 from research.scene import Query, read_scene, write_queries

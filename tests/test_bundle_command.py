@@ -11,9 +11,9 @@ from rooms import scan as scan_of_room
 
 import piccolo
 from piccolo.api.result_files import read_results
+from piccolo.apps.export.formats import export
+from piccolo.apps.export.posed_images import Options
 from piccolo.cli.localize import main
-from piccolo.export.formats import export
-from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.photo import Photo
 from research.scene import read_scene

@@ -10,10 +10,12 @@ from pictures import write
 from rooms import write_room
 
 from piccolo.api.result_files import read_results
+from piccolo.apps import render_pose
+from piccolo.apps.export import export_poses
 from piccolo.camera import Camera, Mount
 from piccolo.camera.calibration import document_of
 from piccolo.camera.model import pinhole
-from piccolo.cli import export_poses, localize, render_pose
+from piccolo.cli import localize
 from piccolo.geometry.pose import exp_so3
 from piccolo.jobs.threads import Workers
 from piccolo.views.pictures import cut, sphere_width_for

@@ -9,8 +9,8 @@ from hypothesis import given, settings, strategies as st
 from refusals import assert_refused, mutated, read_or_refused
 from scans import read_cloud
 
+from piccolo.apps import e57_images
 from piccolo.camera.photo_cameras import find_calibration
-from piccolo.cli import e57_images
 from piccolo.cloud.readers import e57_file
 from piccolo.cloud.readers.e57 import list_images, read_image
 from piccolo.cloud.settings import IN_COLORS

@@ -15,21 +15,12 @@ from scans import read_cloud
 from scipy.spatial import cKDTree
 
 import piccolo
+from piccolo.apps import color_scan as tool
 from piccolo.batch.jobs import steps_file
-from piccolo.cli import color_scan as tool, localize as command_line
+from piccolo.cli import localize as command_line
 from piccolo.cloud.octree import build_octree, recolor
 from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.writers import vertex_rows, write_colored, writing_e57
-from piccolo.coloring import alignment, color_scan
-from piccolo.coloring.alignment import Anchor, add_pairs, align, balance, look, weigh_points
-from piccolo.coloring.color_scan import (
-    PAINTED,
-    find_medians,
-    localize_by_colors,
-    make_aligned_brushes,
-    make_brushes,
-    paint_points,
-)
 from piccolo.errors import InputError, ResourceError
 from piccolo.files.line_file import Journal
 from piccolo.geometry.pose import Pose, pose_errors, step
@@ -39,6 +30,16 @@ from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.judge.result import Result
 from piccolo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map
+from piccolo.together.coloring import alignment, color_scan
+from piccolo.together.coloring.alignment import Anchor, add_pairs, align, balance, look, weigh_points
+from piccolo.together.coloring.color_scan import (
+    PAINTED,
+    find_medians,
+    localize_by_colors,
+    make_aligned_brushes,
+    make_brushes,
+    paint_points,
+)
 
 TIER = "scene"
 

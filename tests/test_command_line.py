@@ -20,8 +20,8 @@ from piccolo.cli import localize, photo_run, prepare_map, terminal
 from piccolo.cli.command import UsageError, checking_options, command, new_parser, parse
 from piccolo.cli.options import add_arguments
 from piccolo.cli.settings import cloud_settings_from
-from piccolo.cli.start import COMMANDS
 from piccolo.cloud.settings import BY_FILE, WITHOUT_COLORS, CloudSettings
+from piccolo.doors import COMMANDS
 from piccolo.errors import InputError, ResourceError, import_optional
 from piccolo.judge.result import Result
 
@@ -218,7 +218,7 @@ def _help(monkeypatch, capsys, program, start):
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_of_an_installed_command_names_no_scripts(monkeypatch, capsys, name):
     program = f"piccolo-{name.replace('_', '-')}"
-    text = _help(monkeypatch, capsys, program, import_module(f"piccolo.cli.{name}").main)
+    text = _help(monkeypatch, capsys, program, import_module(COMMANDS[name]).main)
     assert "\n  piccolo-" in text
     assert ".py" not in text
 

@@ -11,7 +11,7 @@ from poses import jpeg, tilted_poses
 from refusals import mutated, read_or_refused
 from scipy.spatial.transform import Rotation
 
-from piccolo.cli import export_poses
+from piccolo.apps.export import export_poses
 from research.datasets import true_poses
 from research.datasets.convert_dataset import (
     AS_GIVEN,

@@ -21,8 +21,8 @@ from batches import main_of
 
 import piccolo
 from piccolo.api.opening import Cloud
+from piccolo.apps.export.formats import FORMATS as EXPORTS
 from piccolo.cloud.stream import FORMATS
-from piccolo.export.formats import FORMATS as EXPORTS
 from piccolo.kernels.jit import COMPILE_TIME
 from piccolo.photo import Photo, Prior
 from research.synthetic import make_room
@@ -218,7 +218,7 @@ PUBLIC = [
     "piccolo",
     "piccolo.api.opening",
     "piccolo.api.scan",
-    "piccolo.report.build",
+    "piccolo.apps.report.build",
     "piccolo.geometry.pose",
 ]
 

@@ -6,11 +6,11 @@ import pytest
 from poses import SIZE, WIDTH, jpeg, json_of, lines_of, pixels_and_points, result, tilted_poses
 from refusals import assert_input_error
 
+from piccolo.apps.export.formats import export
+from piccolo.apps.export.posed_images import Options
 from piccolo.camera import Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.errors import InputError
-from piccolo.export.formats import export
-from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import exp_so3, log_so3
 
 POSES = tilted_poses(4)

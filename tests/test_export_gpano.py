@@ -11,9 +11,9 @@ from pictures import encoded, smooth_rgb, write
 from poses import jpeg, result, rotation, tilted_poses
 from refusals import assert_input_error, mutated, read_or_refused
 
+from piccolo.apps.export.formats import export
+from piccolo.apps.export.posed_images import Options
 from piccolo.errors import InputError
-from piccolo.export.formats import export
-from piccolo.export.posed_images import Options
 from piccolo.panorama import panorama_size
 from piccolo.panorama.gpano import EMPTY_PACKET, SCAN, jpeg_segments, with_pose, without_pose
 

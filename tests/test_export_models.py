@@ -11,11 +11,11 @@ from plyfile import PlyData
 from poses import jpeg, json_of, result
 from refusals import assert_input_error
 
+from piccolo.apps.export.formats import export
+from piccolo.apps.export.posed_images import Options
 from piccolo.camera import Camera, Mount
 from piccolo.camera.calibration import read_cameras
 from piccolo.cloud.soa import LocalCloud, pack_points
-from piccolo.export.formats import export
-from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, exp_so3, uniform_rotations
 from piccolo.geometry.sphere import pixel_rays
 

@@ -9,11 +9,11 @@ from poses import jpeg, result
 from refusals import assert_input_error
 from rerun.chunk import RrdReader
 
+from piccolo.apps.export import rerun_file
+from piccolo.apps.export.formats import export
+from piccolo.apps.export.posed_images import Options
 from piccolo.camera import Camera, Mount
 from piccolo.cloud.soa import LocalCloud, pack_points
-from piccolo.export import rerun_file
-from piccolo.export.formats import export
-from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, exp_so3, uniform_rotations
 from piccolo.judge.belief import make_belief
 from piccolo.judge.result_parts import Source

@@ -10,9 +10,9 @@ import pytest
 from poses import json_of, lines_of, result, rotation, tilted_poses
 from refusals import assert_input_error
 
+from piccolo.apps.export.formats import export
+from piccolo.apps.export.posed_images import Options
 from piccolo.errors import InputError
-from piccolo.export.formats import export
-from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, heading_pitch_roll_deg, rotation_from_quaternion_wxyz
 from piccolo.judge.result_parts import Gap, Source, WalkFrame
 

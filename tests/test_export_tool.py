@@ -14,10 +14,10 @@ from poses import CENTER, SIZE, jpeg, lines_of, result, tilted_poses, write_resu
 from refusals import mutated, read_or_refused
 
 from piccolo.api.result_files import read_results
-from piccolo.cli import export_poses
+from piccolo.apps.export import export_poses
+from piccolo.apps.export.formats import FORMATS
+from piccolo.apps.export.posed_images import select
 from piccolo.errors import InputError
-from piccolo.export.formats import FORMATS
-from piccolo.export.posed_images import select
 from piccolo.judge.result_parts import Source
 from research.datasets.generic import _table
 

@@ -11,13 +11,13 @@ import rooms
 from poses import CENTER, result, tilted_poses, write_results
 from refusals import small_files
 
-from piccolo.cli import export_poses
+from piccolo.apps.export import export_poses
+from piccolo.apps.export.colmap import write_model
+from piccolo.apps.export.formats import export
+from piccolo.apps.export.posed_images import Options
 from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.writers import vertex_rows, write_colored
 from piccolo.errors import import_optional, text_of
-from piccolo.export.colmap import write_model
-from piccolo.export.formats import export
-from piccolo.export.posed_images import Options
 from piccolo.files import atomic
 from piccolo.panorama.video import frames_at
 from research.synthetic.walk_frames import writing_video

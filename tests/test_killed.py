@@ -11,10 +11,10 @@ from batches import COARSELY, ROOT, untimed
 from pictures import encoded, write
 from poses import result
 
+from piccolo.apps.export.formats import export
+from piccolo.apps.export.posed_images import Options
 from piccolo.batch.jobs import steps_file
 from piccolo.cli.localize import main
-from piccolo.export.formats import export
-from piccolo.export.posed_images import Options
 
 TIER = "process"
 

@@ -10,11 +10,11 @@ from mounts import MOUNT, ORIGIN, body_at
 from poses import result, write_results
 from refusals import assert_input_error, assert_refused
 
+from piccolo.apps.mount import calibrate_mount
+from piccolo.apps.mount.mount import Sighting, Trajectory, fit_mount
 from piccolo.batch.inputs import read_priors
-from piccolo.batch.mount import Sighting, Trajectory, fit_mount
 from piccolo.batch.pose_table import read_pose_table
 from piccolo.batch.relative_poses import read_relative_poses
-from piccolo.cli import calibrate_mount
 from piccolo.geometry.pose import (
     Pose,
     angle_between,

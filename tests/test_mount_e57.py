@@ -9,7 +9,8 @@ from e57_files import ImageToWrite, ScanToWrite, write
 from mounts import MOUNT, body_at
 from poses import result, write_results
 
-from piccolo.cli import calibrate_mount, e57_images
+from piccolo.apps import e57_images
+from piccolo.apps.mount import calibrate_mount
 from piccolo.cloud.readers.e57 import read_image
 from piccolo.geometry.pose import Pose, pose_errors, rotation_from_quaternion_wxyz
 from piccolo.geometry.pose_gaussian import add

@@ -10,12 +10,12 @@ import pytest
 import rooms
 
 from piccolo.cloud.octree import build_octree
-from piccolo.coloring import alignment, passersby
-from piccolo.coloring.alignment import Sightings
-from piccolo.coloring.color_scan import make_brushes, paint_points
-from piccolo.coloring.passersby import cast_votes, remove_passersby, spread_votes, without
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import Panorama
+from piccolo.together.coloring import alignment, passersby
+from piccolo.together.coloring.alignment import Sightings
+from piccolo.together.coloring.color_scan import make_brushes, paint_points
+from piccolo.together.coloring.passersby import cast_votes, remove_passersby, spread_votes, without
 
 SEED = 1
 NUM_POINTS = 60_000

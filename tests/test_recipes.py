@@ -21,11 +21,12 @@ from e57_files import ImageToWrite, ScanToWrite
 from poses import result, write_results
 
 from piccolo.api.result_files import read_results
+from piccolo.apps.export.formats import export, tum_lines
+from piccolo.apps.export.posed_images import Options
 from piccolo.cli.command import new_parser, parse
 from piccolo.cloud.readers.e57 import list_images
 from piccolo.cloud.writers import vertex_rows
-from piccolo.export.formats import export, tum_lines
-from piccolo.export.posed_images import Options
+from piccolo.doors import COMMANDS
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.judge.pose_covariance import PoseCovariance
 
@@ -89,7 +90,7 @@ def _check(program, words):
     """Parse a command's options, check that its inputs are there, and write what it would write."""
     name = Path(program).stem
     parser = new_parser(name, "", "")
-    import_module(f"piccolo.cli.{name}").add_arguments(parser)
+    import_module(COMMANDS[name]).add_arguments(parser)
     arguments = parse(parser, words)
     for option in INPUTS:
         given = getattr(arguments, option, None) or []

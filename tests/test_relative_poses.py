@@ -9,9 +9,9 @@ import pytest
 from poses import SIZE, assert_same_poses, result, tilted_poses
 from refusals import assert_refused
 
+from piccolo.apps.export.formats import export
+from piccolo.apps.export.posed_images import Options
 from piccolo.batch.relative_poses import find_scale, read_odometry, read_relative_poses, read_tum_row
-from piccolo.export.formats import export
-from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import (
     OPTICAL_FROM_CAM,
     rotation_from_quaternion_wxyz,

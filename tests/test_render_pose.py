@@ -9,7 +9,8 @@ import poses
 import pytest
 import rooms
 
-from piccolo.cli import prepare_map, render_pose
+from piccolo.apps import render_pose
+from piccolo.cli import prepare_map
 from piccolo.geometry.pose import heading_pitch_roll_deg
 from research.datasets import true_poses
 from research.scene import read_scene

@@ -8,8 +8,8 @@ import pytest
 from poses import write_results
 from report_scenes import HOSTILE, House, document_of, mixed_house, pictures_of
 
-from piccolo.cli import report
-from piccolo.report.site import collect_entries, shorten_names, unique_names
+from piccolo.apps.report import report
+from piccolo.apps.report.site import collect_entries, shorten_names, unique_names
 
 TIER = "scene"
 

@@ -11,10 +11,10 @@ import pytest
 from refusals import assert_input_error
 from report_scenes import HOSTILE, House, lifted
 
-from piccolo.cli import report
+from piccolo.apps.report import report
+from piccolo.apps.report.pictures import PIXEL, plan_matrix, read_control_points
+from piccolo.apps.report.plan_file import COLORS, DPI, color_of, segments_of
 from piccolo.errors import InputError
-from piccolo.report.pictures import PIXEL, plan_matrix, read_control_points
-from piccolo.report.plan_file import COLORS, DPI, color_of, segments_of
 
 TIER = "scene"
 

@@ -11,10 +11,10 @@ from results import ALTERNATIVE, POSE, RESULT
 
 from piccolo.api.photo_reader import unreadable_result
 from piccolo.api.result_files import read_results
+from piccolo.apps.report.site import NOT_TOLD
 from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result
 from piccolo.judge.result_parts import Source
-from piccolo.report.site import NOT_TOLD
 
 ROOT = Path(__file__).resolve().parents[1]
 WITHOUT_ARRAYS = {"status": "not_localized", "best_pose": None, "alternatives": (), "covariance": None}

@@ -18,11 +18,11 @@ import rooms
 from batches import workers_of
 from services import serving
 
+from piccolo.apps.service.asking import clean_name
+from piccolo.apps.service.description import describe_service
 from piccolo.cli import localize
 from piccolo.judge.result import Result
 from piccolo.photo import Photo, Prior
-from piccolo.service.asking import clean_name
-from piccolo.service.description import describe_service
 
 TIER = "process"
 

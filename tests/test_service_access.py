@@ -8,7 +8,7 @@ import pytest
 from refusals import assert_input_error
 from services import serving
 
-from piccolo.cli.serve import check_url
+from piccolo.apps.service.serve import check_url
 
 TIER = "process"
 

@@ -12,7 +12,7 @@ import pytest
 import uvicorn
 from services import serving
 
-from piccolo.service import connections
+from piccolo.apps.service import connections
 
 TIER = "process"
 

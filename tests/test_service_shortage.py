@@ -10,7 +10,7 @@ import pytest
 from batches import workers_of
 from services import serving
 
-from piccolo.service.connections import LINES
+from piccolo.apps.service.connections import LINES
 
 TIER = "process"
 

@@ -14,8 +14,9 @@ import pytest
 from batches import ROOT, command_of, run
 from rooms import query, scan_map, write_room
 
-from piccolo.cli import localize, start
-from piccolo.cli.start import COMMANDS
+from piccolo import doors
+from piccolo.cli import localize
+from piccolo.doors import COMMANDS
 from piccolo.scan_map.map_file import save_map
 
 TIER = "scene"
@@ -73,11 +74,11 @@ def test_threads_share_two_arenas_unless_the_environment_says_more(tmp_path, tol
 @pytest.mark.process
 def test_console_commands_begin_before_their_libraries():
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-    assert scripts == {f"piccolo-{n.replace('_', '-')}": f"piccolo.cli.start:{n}" for n in COMMANDS}
-    code = "import sys; from piccolo.cli.start import localize; sys.exit('numpy' in sys.modules)"
+    assert scripts == {f"piccolo-{n.replace('_', '-')}": f"piccolo.doors:{n}" for n in COMMANDS}
+    code = "import sys; from piccolo.doors import localize; sys.exit('numpy' in sys.modules)"
     assert run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
     with pytest.raises(AttributeError, match="no command 'loclize'"):
-        _ = start.loclize
+        _ = doors.loclize
 
 
 @pytest.mark.process

@@ -11,7 +11,7 @@ import rooms
 from hypothesis import given, settings, strategies as st
 from refusals import mutated, read_or_refused
 
-from piccolo.cli.render_pose import read_pose_matrix
+from piccolo.apps.render_pose import read_pose_matrix
 from piccolo.cloud.soa import LocalCloud, pack_points
 from piccolo.errors import InputError
 from piccolo.geometry.pose import (

@@ -13,10 +13,10 @@ from walks import SEED, assert_right, list_frames, run_localize, write_walk
 
 from piccolo.api.result_files import read_results
 from piccolo.api.scan_walk import Walk
+from piccolo.apps.export.formats import tum_lines
 from piccolo.batch.jobs import steps_file
 from piccolo.cli import localize
 from piccolo.errors import InputError
-from piccolo.export.formats import tum_lines
 from piccolo.geometry.pose import Pose, carry, yaw_rotation
 from piccolo.jobs import memory
 from piccolo.panorama import picture

@@ -1,4 +1,4 @@
 #!/usr/bin/env python3
 from _checkout import run
 
-run(__name__, "piccolo.cli.align_gravity")
+run(__name__, "piccolo.apps.align_gravity")

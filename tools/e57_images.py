@@ -1,4 +1,4 @@
 #!/usr/bin/env python3
 from _checkout import run
 
-run(__name__, "piccolo.cli.e57_images")
+run(__name__, "piccolo.apps.e57_images")

@@ -1,4 +1,4 @@
 #!/usr/bin/env python3
 from _checkout import run
 
-run(__name__, "piccolo.cli.serve")
+run(__name__, "piccolo.apps.service.serve")

@@ -11,7 +11,6 @@ from ..arguments import check_kind, check_one_each
 from ..arrays import Bytes, Floats
 from ..cloud.settings import CloudSettings
 from ..cloud.soa import PackedPoints
-from ..coloring.color_scan import Coloring
 from ..errors import InputError
 from ..evidence.occlusion import occlusion_mask
 from ..files.atomic import check_output
@@ -27,6 +26,7 @@ from ..problem.settings import CoarseToFineSettings
 from ..scan_map.open_map import write_map
 from ..scan_map.scan_map import ScanMap, check_within
 from ..together.bundle_adjustment import RelativePoses
+from ..together.coloring.color_scan import Coloring
 from ..together.second_looks import Look, localize_in_order
 from ..together.walk.frames import Motion
 from ..together.walk.tracker import Tracker

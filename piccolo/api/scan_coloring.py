@@ -7,7 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from ..cloud.settings import CloudSettings
-from ..coloring.color_scan import (
+from ..errors import InputError
+from ..files.atomic import check_output
+from ..files.line_file import Journal
+from ..jobs.threads import Workers
+from ..judge.result import Result
+from ..scan_map.scan_map import ScanMap
+from ..together.coloring.color_scan import (
     OF_RESULTS,
     Coloring,
     check_files,
@@ -15,12 +21,6 @@ from ..coloring.color_scan import (
     color_if_enough,
     localize_for_colors,
 )
-from ..errors import InputError
-from ..files.atomic import check_output
-from ..files.line_file import Journal
-from ..jobs.threads import Workers
-from ..judge.result import Result
-from ..scan_map.scan_map import ScanMap
 from .scan_photo import Asked
 
 

@@ -16,7 +16,6 @@ from ..api.scan import Scan
 from ..api.scan_bundle import AskedPosed, localize_posed
 from ..api.scan_group import OF_RESULTS, AskedTogether, localize_photos_together
 from ..api.scan_walk import Walk
-from ..coloring import color_scan
 from ..errors import InputError
 from ..files.atomic import STDOUT, is_stream, write_lines
 from ..files.line_file import Journal, keeping_steps
@@ -30,6 +29,7 @@ from ..panorama.photo import sha256_of
 from ..photo import Photo
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
+from ..together.coloring import color_scan
 from .localizer import Localizer, rename
 from .relative_poses import find_scale, read_relative_poses
 from .results_file import WAYS, Records

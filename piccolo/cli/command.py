@@ -23,7 +23,7 @@ from ..errors import InputError, printable, text_of
 from ..files.atomic import check_output, is_stdout, is_stream
 from ..jobs.memory import check_address_space, is_shortage
 from ..jobs.threads import Progress, Workers, num_cores
-from .start import EXIT_INTERRUPTED, EXIT_TERMINATED, as_started, for_terminal, load, quit_at_once
+from .start import EXIT_INTERRUPTED, EXIT_TERMINATED, for_terminal, load, name_of, quit_at_once
 from .terminal import LOG, progress_bar, showing_log
 
 KINDS: dict[str, type] = {  # of the values, by the first metavar; of others text
@@ -117,7 +117,7 @@ def new_parser(
     name: str, description: str | None, epilog: str, exit_codes: str = "0 done"
 ) -> argparse.ArgumentParser:
     """Return a parser of the command `name` with the options of all; `exit_codes` are its own, below 2."""
-    program = as_started(f"{name}.py")
+    program = name_of(name)
     epilog += f"exit codes: {exit_codes}, {EXIT_CODES}"
     parser = argparse.ArgumentParser(program, None, description, epilog, formatter_class=HelpFormatter)
     parser.set_defaults(program=program, quiet=False, debug=False)

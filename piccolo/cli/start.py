@@ -1,26 +1,17 @@
-"""The beginning of a command: signals and streams, before the libraries are imported, for a second.
-
-`piccolo.cli.start.NAME` is a function without arguments that runs the command NAME, for console commands.
-"""
+"""The beginning of a command: signals and streams, before the libraries are imported, for a second."""
 
 import os
 import re
 import signal
 import sys
-from collections.abc import Callable
-from functools import partial
 from importlib import import_module
 from types import FrameType
 from typing import Any
 
 from ..jobs.memory import limit_of_process, share_arenas
 
-# Modules of this folder that are commands: scripts of the checkout, and piccolo-NAME where it is installed.
-COMMANDS = (
-    "localize", "align_gravity", "prepare_map", "render_pose", "color_scan", "export_poses", "report",
-    "e57_images", "calibrate_mount", "align_model", "serve",
-)  # fmt: skip
-SCRIPT = re.compile(rf"(?:python )?(?:tools/)?\b({'|'.join(COMMANDS)})\.py\b")
+# a command in a text, by the script of the checkout
+SCRIPT = re.compile(r"(?:python )?(?:\b(localize)|tools/(\w+))\.py\b")
 # a parameter of the API in a message, the unit in its name, and those whose flag has another name
 PARAMETER = re.compile("`([a-z][a-z0-9_]*)`")
 UNIT = re.compile("_(deg|px|world)$")
@@ -38,13 +29,6 @@ EXIT_INTERRUPTED = 130
 EXIT_TERMINATED = 143
 
 
-def __getattr__(name: str) -> Callable[[], int]:
-    """Return a function that runs the command `name`."""
-    if name not in COMMANDS:
-        raise AttributeError(f"piccolo has no command {name!r}")
-    return partial(run, f"piccolo.cli.{name}")
-
-
 def for_terminal(text: str) -> str:
     """Return a message in the words of the command line: parameters in backticks become flags."""
     return PARAMETER.sub(
@@ -54,9 +38,17 @@ def for_terminal(text: str) -> str:
 
 def as_started(text: str) -> str:
     """Return a text that names commands as scripts, as installed commands if one of these was started."""
-    if not os.path.basename(sys.argv[0]).startswith("piccolo-"):  # noqa: PTH119
-        return text
-    return SCRIPT.sub(lambda match: f"piccolo-{match[1].replace('_', '-')}", text)
+    return SCRIPT.sub(lambda match: name_of(match[1] or match[2]), text) if is_installed() else text
+
+
+def is_installed() -> bool:
+    """Return True if an installed command was started, no script of a checkout."""
+    return os.path.basename(sys.argv[0]).startswith("piccolo-")  # noqa: PTH119
+
+
+def name_of(command: str) -> str:
+    """Return the name under which a command is started."""
+    return f"piccolo-{command.replace('_', '-')}" if is_installed() else f"{command}.py"
 
 
 def run(module: str) -> int:

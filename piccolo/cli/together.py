@@ -25,7 +25,6 @@ from ..batch.jobs import (
 )
 from ..batch.localizer import Localizer
 from ..batch.relative_poses import read_odometry
-from ..coloring import color_scan
 from ..files.atomic import temporary_folder
 from ..jobs.interruption import Interruption
 from ..jobs.processes import Pair
@@ -33,6 +32,7 @@ from ..judge.result import Result
 from ..panorama.photo import sha256_of
 from ..panorama.video import choose_distinct, frames_of_chapters
 from ..photo import Photo
+from ..together.coloring import color_scan
 from ..together.series import MOST_IN_SERIES
 from ..together.walk.frames import Motion
 from . import terminal

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from piccolo.apps.export.formats import cell
 from piccolo.arrays import Array
 from piccolo.errors import import_optional, printable
-from piccolo.export.formats import cell
 from piccolo.judge.result import Result
 
 from ..scene import Query, Scene

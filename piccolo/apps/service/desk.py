@@ -1,0 +1,189 @@
+"""A scan that is open to questions: what a page shows of it, and the processes that answer.
+
+Photos come as their content: a process writes one into a temporary folder for as long as it is at work on it.
+"""
+
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ...api.scan import Scan
+from ...batch.localizer import Localizer, Task
+from ...errors import InputError
+from ...files.atomic import temporary_folder
+from ...jobs.processes import Function, Processes
+from ...jobs.threads import Workers
+from ...judge.result import Result
+from ...panorama.picture import open_picture
+from ...scan_map.open_map import write_map
+from ...scan_map.scan_map import ScanMap
+from ...views.surfels import MAX_SURFELS, make_surfels
+from ..report import site
+from ..report.build import WIDTH, document_of_scan, list_poses
+from ..report.pictures import make_pictures
+
+PIXELS = 1e6  # in a megapixel
+MAP = "service.piccolo-map"
+
+
+class Limits(NamedTuple):
+    """Bounds of what a request may take."""
+
+    max_bytes: int  # of its body
+    max_pixels: float  # of a picture, by its header
+    max_waiting: int  # requests at once; one more is sent away
+    seconds: float  # from the moment that a process takes it
+
+
+class Sent(NamedTuple):
+    """The photos of a request."""
+
+    tasks: Sequence[Task]
+    are_together: bool  # they are of one place
+
+
+class Drawing(NamedTuple):
+    """A photo whose pictures are wanted, for the page."""
+
+    task: Task
+    result: Result
+
+
+@dataclass
+class Desk:
+    """An open scan. Its processes open a map of its own, so the scan's files may be replaced meanwhile."""
+
+    localizer: Localizer
+    scan_map: ScanMap
+    document: dict[str, Any]  # what the page knows of the scan
+    plans: dict[str, bytes]  # PNG, by the name that the document has
+    processes: Processes  # of `open_answering`
+    files: object  # what `look_at` said of the scan's files
+    end: ExitStack  # of the folder of the map
+    num_users: int = 0
+    is_retired: bool = False
+
+    @contextmanager
+    def in_use(self) -> Iterator["Desk"]:
+        """Yield the desk, which stays open within this."""
+        self.num_users += 1
+        try:
+            yield self
+        finally:
+            self.num_users -= 1
+            self._close_if_idle()
+
+    def retire(self) -> None:
+        """Close when nobody uses it any more."""
+        self.is_retired = True
+        self._close_if_idle()
+
+    def close(self) -> None:
+        """Kill the processes and remove the map."""
+        self.processes.close()
+        self.end.close()
+
+    def _close_if_idle(self) -> None:
+        if self.is_retired and not self.num_users:
+            self.close()
+
+
+def open_desk(
+    localizer: Localizer, num_jobs: int, limits: Limits, keeps_photos: bool, workers: Workers
+) -> Desk:
+    """Open a scan, with its local features, so that no photo waits for these; InputError if it can't be."""
+    files = look_at(localizer.paths)
+    opened = localizer.open_scan(workers)
+    scan_map, _ = opened.require_default_method("the service", localizer.settings)
+    end = ExitStack()
+    folder = end.enter_context(temporary_folder())
+    write_map(scan_map, folder / MAP)
+    localizer = replace(localizer, map_name=str(folder / MAP))
+    site.begin_folder(folder)
+    document = document_of_scan(scan_map, localizer.name, folder)
+    drawn = [storey["plan"]["file"] for storey in document["storeys"] if storey["plan"]]
+    plans = {name: (folder / name).read_bytes() for name in drawn}
+    points = scan_map.points
+    extent = [[float(axis.min()), float(axis.max())] for axis in (points.x, points.y, points.z)]
+    about = {"scanSha256": scan_map.scan_sha256, "scans": list(scan_map.scan_names), "extent": extent}
+    terms = {"maxBytes": limits.max_bytes, "keepsPhotos": keeps_photos}
+    document |= {**about, "note": "", "photos": [], "service": terms}
+    answering = partial(open_answering, localizer, limits.max_pixels)
+    processes = Processes(answering, num_jobs, localizer.num_threads, limits.seconds)
+    for _ in range(num_jobs):
+        processes.submit(None)
+    return Desk(localizer, scan_map, document, plans, processes, files, end)
+
+
+def look_at(paths: Sequence[Path]) -> list[object]:
+    """Return what changes when a file of a scan is replaced or written to."""
+    found: list[object] = []
+    for path in paths:
+        try:
+            status = path.stat()
+            found.append((status.st_ino, status.st_size, status.st_mtime_ns))
+        except OSError as error:
+            found.append(error.errno)
+    return found
+
+
+def open_answering(localizer: Localizer, max_pixels: float) -> Function:
+    """Open what a process answers with.
+
+    Photos that were sent get their results, and several help each other; a `Drawing` gets the JSON of its
+    pictures; None makes ready for both.
+    """
+    tempfile.tempdir = os.environ.get("TMPDIR")  # or it is tried out, and on a full disk found not to exist
+    scan = localizer.open_here()
+    answer = localizer.answer_in(scan)
+
+    @cache
+    def surfels() -> Any:
+        points = scan.prepared.points.subsample(MAX_SURFELS)
+        return make_surfels(points, scan.workers), points
+
+    def work(item: Sent | Drawing | None) -> list[Result] | str | None:
+        if isinstance(item, Drawing):
+            return draw(scan, surfels(), item)
+        if item is None:
+            surfels()
+            return None
+        for task in item.tasks:
+            check_size(task, max_pixels)
+        if len(item.tasks) == 1:
+            return [answer(item.tasks[0]).result]
+        if item.are_together:
+            return localizer.answer_group(scan, item.tasks)
+        return localizer.answer_in_order(scan, item.tasks)
+
+    return work
+
+
+def check_size(task: Task, max_pixels: float) -> None:
+    """Refuse a picture with more pixels than a service takes, before it is decoded."""
+    name = task.photo.name
+    width = height = 0
+    with suppress(InputError), open_picture(Path(name), content_of(task)) as image:
+        width, height = image.size  # what is no picture is refused by what reads it
+    if width * height > max_pixels:
+        found = f"found {width} x {height} px"
+        raise InputError(f"{name}: {found}, wanted at most {max_pixels / PIXELS:g} megapixels")
+
+
+def content_of(task: Task) -> bytes:
+    """Return the picture that was sent."""
+    return (task.files or {})[task.photo.name]
+
+
+def draw(scan: Scan, surfels: Any, drawing: Drawing) -> str:
+    """Return JSON of a photo's thumbnail and pictures."""
+    result = drawing.result
+    poses = list_poses(result, scan.prepared.from_world)
+    with drawing.task.place(Path()) as photo:
+        thumbnail, pictures = make_pictures(photo.path, result, poses, surfels, WIDTH)
+    return f'{{"thumb": "{site.data_url(thumbnail, "image/jpeg")}", "pictures": {pictures}}}'
