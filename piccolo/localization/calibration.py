@@ -141,7 +141,10 @@ def calibrate_sphere(
 def retake_as_found(
     problem: Problem, found: Selection, claimed: Camera, workers: Workers
 ) -> tuple[Problem, Selection, SphereFit] | None:
-    """Search other geometries; return the problem with one that explains clearly more, refined, or None."""
+    """Search other geometries; return the problem with one that explains clearly more, refined, or None.
+
+    One that explains less than what the photo claims already does is not refined.
+    """
     end = search_geometry(problem, found.best.pose, claimed, workers)
     if count_deviations(estimate_corrections(end, SPHERE_CURVATURE)) < CONTRADICTED_DEVIATIONS:
         return None
@@ -153,6 +156,8 @@ def retake_as_found(
         problem = problem.retake(given.retake(camera))
         others = [h.pose for h in best.alternatives]
         scored = examine_each(problem, [end.pose, *others], workers)
+        if scored[0].score < found.best.score:
+            return None
         best = refine_best(problem, scored, workers)
         pose = best.best.pose
         points = problem.view_at(pose, "points")
