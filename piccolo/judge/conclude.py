@@ -10,11 +10,10 @@ from .case import Case, Geometry
 from .consensus import MOST_CONFLICT, Opinion
 from .pose_covariance import describe_errors
 from .probability import LOCALIZED
-from .reasons import Reason, explain
+from .reasons import MIRRORED, Reason, explain
 from .result import Result
 from .result_parts import Alternative, FocalLength
 
-MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
 NOT_AS_CLAIMED = (
     "the panorama does not show 360 x 180 degrees with the horizon in the middle: give it as it was "
     "stitched, not cropped or stretched"

@@ -27,6 +27,7 @@ class Contradiction(NamedTuple):
     told: tuple[float, ...] | str
 
 
+MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
 # of poses that contradict what was told
 WORDS: Mapping[Reason, str] = {
     Reason.WITHIN: "the pose found is in the scan {found!r}, not in {told}",

@@ -39,6 +39,7 @@ from .links import (
     spread,
 )
 from .members import Member, Shot, find_members
+from .mirrored import refuse_mirrored
 from .nearby import localize_nearby
 
 NUM_ANCHORS = 5  # poses of a photo from which a place of the group may follow, the likeliest
@@ -150,6 +151,8 @@ def localize_linked(members: Mapping[int, Member], means: Means, demand: Demand)
             found: dict[int, Result] = {}
             if probabilities[0] >= EVEN_ODDS:
                 found = judge_group(group, tested, probabilities, means, demand)
+                if not list_sure(group, tested[0]):
+                    found = refuse_mirrored(found, members, means, demand.min_confidence)
             for k, result in found.items():
                 grouped[k] = Grouped(result, tuple(other for other in found if other != k))
             left -= found.keys() or tested[0].places.keys()
