@@ -12,8 +12,8 @@ import pytest
 from piccolo.api.result_files import read_results
 from piccolo.apps.report import report
 from piccolo.cloud.settings import BY_FILE
-from piccolo.jobs.threads import Workers
 from piccolo.scan_map.open_map import open_points
+from piccolo.system.jobs.threads import Workers
 
 FIELD = 70.0  # [deg]
 LABEL = re.compile(r"([\d.]+) m ± (\d+) mm(?:, ([\d.]+) m horizontal, ([\d.]+) m vertical)?")

@@ -9,10 +9,10 @@ import pytest
 from report_scenes import HOSTILE
 
 from piccolo.api.result_files import read_results
-from piccolo.camera.model import pinhole
 from piccolo.cloud.settings import BY_FILE
-from piccolo.jobs.threads import Workers
+from piccolo.photo.camera.model import pinhole
 from piccolo.scan_map.open_map import open_points
+from piccolo.system.jobs.threads import Workers
 from piccolo.views.pictures import cut, fill_holes
 from piccolo.views.surfels import render_points
 

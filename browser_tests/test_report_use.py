@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from piccolo.api.result_files import read_results
-from piccolo.panorama.cameras import GUESS, HOW
-from piccolo.panorama.read import CHOICES
+from piccolo.photo.panorama.cameras import GUESS, HOW
+from piccolo.photo.panorama.read import CHOICES
 
 DOWNLOAD = "Download as a table (CSV)"
 # the names of all photos that the key n leads to

@@ -3,7 +3,6 @@ from .api.opening import Cloud as Cloud, open_scan as open_scan
 from .api.scan import Scan as Scan
 from .api.scan_walk import Walk as Walk
 from .apps.report.build import ReportSettings as ReportSettings, write_report as write_report
-from .errors import InputError as InputError
 from .geometry.pose import Pose as Pose
 from .judge.pose_covariance import PoseCovariance as PoseCovariance
 from .judge.result import Result as Result
@@ -16,10 +15,11 @@ from .judge.result_parts import (
     Source as Source,
     WalkFrame as WalkFrame,
 )
-from .paper.localize import PaperSettings as PaperSettings
-from .photo import GpsPrior as GpsPrior, Photo as Photo, Prior as Prior
+from .localization.paper import PaperSettings as PaperSettings
+from .photo.photo import GpsPrior as GpsPrior, Photo as Photo, Prior as Prior
 from .problem.accuracy import Accuracy as Accuracy
 from .problem.settings import CoarseToFineSettings as CoarseToFineSettings
+from .system.errors import InputError as InputError
 from .together.bundle_adjustment import RelativePoses as RelativePoses
 from .together.coloring.color_scan import Coloring as Coloring
 from .together.walk.frames import Motion as Motion

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from piccolo.camera import Calibration, Mount
-from piccolo.camera.calibration import document_of, read_mounts
-from piccolo.errors import InputError
-from piccolo.files.atomic import write_atomically
-from piccolo.files.json_file import naming, read_json
 from piccolo.geometry.pose import Pose, check_pose
 from piccolo.geometry.sphere import CONVENTION
+from piccolo.photo.camera import Calibration, Mount
+from piccolo.photo.camera.calibration import document_of, read_mounts
+from piccolo.system.errors import InputError
+from piccolo.system.files.atomic import write_atomically
+from piccolo.system.files.json_file import naming, read_json
 
 QUERIES_NAME = "queries.json"
 CLOUD_NAME = "cloud.ply"

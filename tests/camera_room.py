@@ -4,7 +4,7 @@ import functools
 
 import rooms
 
-from piccolo.jobs.threads import Workers
+from piccolo.system.jobs.threads import Workers
 from research.synthetic.world import make_query, pose_of_query
 
 SEED = 5

@@ -4,10 +4,10 @@ import functools
 
 import numpy as np
 
-from piccolo.camera import Calibration, Mount
-from piccolo.camera.model import pinhole
 from piccolo.geometry.pose import exp_so3
-from piccolo.photo import Photo
+from piccolo.photo.camera import Calibration, Mount
+from piccolo.photo.camera.model import pinhole
+from piccolo.photo.photo import Photo
 
 
 def calibrated(picture, mounts):

@@ -11,10 +11,10 @@ from batches import COARSE
 from consistency import contradictions_of_line, find_contradictions, lines_of_results
 
 from piccolo.cloud.readers import e57, las, mesh, reader, text
-from piccolo.files import cache
-from piccolo.jobs.memory import limit_memory
 from piccolo.judge.result import Result
-from piccolo.kernels import jit
+from piccolo.system.files import cache
+from piccolo.system.jobs.memory import limit_memory
+from piccolo.system.kernels import jit
 from piccolo.together.coloring import alignment, passersby
 
 # A shell starts what runs in the background with Ctrl-C ignored, as then would be what a test starts.

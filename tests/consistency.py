@@ -7,9 +7,9 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 
-from piccolo.arguments import MIN_CONFIDENCE
 from piccolo.geometry.nearness import RIGHT
 from piccolo.judge.result import FAILED, FORMAT, UNREADABLE, Result
+from piccolo.system.arguments import MIN_CONFIDENCE
 
 SCHEMA = json.loads((Path(__file__).resolve().parents[1] / "docs" / "result.schema.json").read_text())
 VALIDATOR = jsonschema.Draft202012Validator(SCHEMA)

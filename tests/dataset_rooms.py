@@ -11,12 +11,12 @@ from pictures import encoded
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from piccolo.cloud.soa import pack_points
+from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import Pose
-from piccolo.jobs.threads import Workers
 from piccolo.optimize.sampling_loss import sampling_loss
-from piccolo.panorama import read_panorama
-from piccolo.panorama.texels import pack_texels
+from piccolo.photo.panorama import read_panorama
+from piccolo.photo.panorama.texels import pack_texels
+from piccolo.system.jobs.threads import Workers
 from piccolo.views.zbuffer import visible_points
 from research.datasets import convert_dataset
 from research.scene import read_scene

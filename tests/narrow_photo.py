@@ -7,8 +7,8 @@ import rooms
 
 from piccolo.evidence import verification
 from piccolo.geometry.pose import Pose, yaw_rotation
-from piccolo.jobs.threads import Workers
-from piccolo.panorama import Panorama
+from piccolo.photo.panorama import Panorama
+from piccolo.system.jobs.threads import Workers
 from research.synthetic.world import change_light, mask_outside_field, photograph
 
 NUM_POINTS = 200_000

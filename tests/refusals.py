@@ -7,8 +7,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from piccolo.errors import InputError
-from piccolo.photo import Photo
+from piccolo.photo.photo import Photo
+from piccolo.system.errors import InputError
 
 
 def assert_input_error(message, call, *arguments, **options):

@@ -11,11 +11,11 @@ import numpy as np
 from piccolo.api.photo_reader import unreadable_result
 from piccolo.apps.report import report
 from piccolo.geometry.pose import Pose, yaw_rotation
-from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.judge.result import Result
 from piccolo.judge.result_parts import Alternative, Evidence, Gap, Source, WalkFrame
+from piccolo.system.jobs.threads import Workers
 from piccolo.views.pictures import encode_image
 from research.synthetic.world import make_world, photograph, pose_of_query, scan_world
 

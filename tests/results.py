@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from piccolo.camera import Mount
-from piccolo.camera.model import pinhole
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.judge.belief import make_belief
 from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.judge.result import Result
 from piccolo.judge.result_parts import Alternative, Beside, Evidence, Source
+from piccolo.photo.camera import Mount
+from piccolo.photo.camera.model import pinhole
 
 POSE = Pose(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([500_000.123, 4_000_000.456, 12.0]))
 EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.6, 0.9, 0.5)

@@ -12,19 +12,19 @@ import numpy as np
 
 from piccolo.api.scan import Scan
 from piccolo.cloud.settings import CloudSettings
-from piccolo.cloud.soa import pack_points
 from piccolo.cloud.stream import Cloud, stream_of_arrays
 from piccolo.cloud.voxels import VoxelTable, morton_order
 from piccolo.cloud.writers import vertex_rows, writing_ply
+from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import Pose, angle_between, yaw_rotation
-from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization.localize import localize
 from piccolo.localization.means import Means, Trace
-from piccolo.panorama import Panorama
+from piccolo.photo.panorama import Panorama
 from piccolo.problem.problem import prepare_problem
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_map import prepare_map
+from piccolo.system.jobs.threads import Stopwatch, Workers
 from piccolo.views.view import average_view, normalize_view
 from research.synthetic import make_room
 from research.synthetic.world import make_query, make_world, mask_outside_field, photograph, scan_world

@@ -14,10 +14,10 @@ from poses import result, write_results
 from refusals import assert_input_error
 
 from piccolo.cli.command import UsageError, check_distinct, check_outputs, check_suffix, command
-from piccolo.errors import InputError
-from piccolo.files import atomic
-from piccolo.files.line_file import open_locked, whole_lines, whole_size
 from piccolo.geometry.pose import Pose
+from piccolo.system.errors import InputError
+from piccolo.system.files import atomic
+from piccolo.system.files.line_file import open_locked, whole_lines, whole_size
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -135,7 +135,9 @@ def test_stdout_gets_bytes(name, capfdbinary):
 @pytest.mark.process
 @pytest.mark.parametrize(("redirection", "found"), [("> out", "1\n2\n3\n"), (">&-", "found a closed stdout")])
 def test_stdout_redirected_keeps_what_is_printed_around_it(tmp_path, redirection, found):
-    code = "from piccolo.files.atomic import *; print(1); write_atomically(Path('-'), b'2\\n'); print(3)"
+    code = (
+        "from piccolo.system.files.atomic import *; print(1); write_atomically(Path('-'), b'2\\n'); print(3)"
+    )
     command = f'cd "{tmp_path}" && PYTHONPATH="{ROOT}" "{sys.executable}" -c "{code}" {redirection}'
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
     assert found in ((tmp_path / "out").read_text() if "out" in redirection else done.stderr)
@@ -273,7 +275,7 @@ def test_a_lock_whose_file_was_removed_before_it_was_taken_is_taken_again(tmp_pa
 HOLD = """
 import sys, time
 from pathlib import Path
-from piccolo.files.line_file import open_locked
+from piccolo.system.files.line_file import open_locked
 with open_locked(Path(sys.argv[1])) as file:
     file.append("{}")
     print(flush=True)
@@ -312,7 +314,7 @@ def test_a_full_disk_keeps_the_lines_before(tmp_path):
     code = """
 import resource, sys
 from pathlib import Path
-from piccolo.files.line_file import open_locked
+from piccolo.system.files.line_file import open_locked
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 with open_locked(Path(sys.argv[1])) as file:
     for k in range(9):

@@ -22,7 +22,6 @@ from piccolo.evidence.examine import examine
 from piccolo.evidence.verification import round_pose
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import Pose, exp_so3, step
-from piccolo.jobs.threads import Workers
 from piccolo.judge.candidate import Drawn
 from piccolo.judge.probability import LOCALIZED
 from piccolo.judge.selection import is_clear
@@ -30,12 +29,13 @@ from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import attempts, beam, localize as method
 from piccolo.localization.means import NO_TRACE
 from piccolo.localization.search import search_poses
-from piccolo.panorama import GPano, Panorama
-from piccolo.photo import Prior
+from piccolo.photo.panorama import GPano, Panorama
+from piccolo.photo.photo import Prior
 from piccolo.problem.method import METHOD
 from piccolo.problem.photo_images import MIRROR
 from piccolo.problem.settings import CoarseToFineSettings, Effort
 from piccolo.scan_map.drawn_places import DrawnPlaces
+from piccolo.system.jobs.threads import Workers
 from research.synthetic.world import mask_outside_field
 
 TIER = "scene"

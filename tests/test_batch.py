@@ -17,7 +17,7 @@ from piccolo.api.result_files import read_results
 from piccolo.batch import localizer as module
 from piccolo.batch.inputs import list_panoramas
 from piccolo.cli import localize, settings
-from piccolo.errors import InputError
+from piccolo.system.errors import InputError
 from research.scene import read_scene
 
 TIER = "scene"

@@ -26,18 +26,18 @@ from piccolo.api.result_files import read_results
 from piccolo.api.scan import Scan
 from piccolo.api.second_look import Looking, Others
 from piccolo.batch.localizer import Localizer
-from piccolo.camera import Mount
-from piccolo.camera.calibration import document_of
-from piccolo.camera.model import pinhole
 from piccolo.cli import localize
 from piccolo.cloud.settings import CloudSettings
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, yaw_rotation
-from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.pose_covariance import describe_errors
 from piccolo.judge.result_parts import Beside
-from piccolo.photo import Photo
+from piccolo.photo.camera import Mount
+from piccolo.photo.camera.calibration import document_of
+from piccolo.photo.camera.model import pinhole
+from piccolo.photo.photo import Photo
+from piccolo.system.errors import InputError
+from piccolo.system.jobs.threads import Workers
 from piccolo.together.second_looks import Look
 from research.synthetic.world import render_picture
 

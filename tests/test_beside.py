@@ -12,7 +12,6 @@ from piccolo.evidence import verification
 from piccolo.evidence.focal_length import FocalFit
 from piccolo.geometry.pose import Pose
 from piccolo.geometry.pose_gaussian import LIKELY, PoseGaussian, subtract
-from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import NO_CHOICE
 from piccolo.judge.reasons import Reason
@@ -20,7 +19,8 @@ from piccolo.judge.result import Result, nothing_found
 from piccolo.local_features.hypotheses import exact_pose
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization.judging import Found
-from piccolo.photo import Prior
+from piccolo.photo.photo import Prior
+from piccolo.system.jobs.threads import Stopwatch, Workers
 from piccolo.together.beside import Neighbor, SurePhoto, fuse, localize_beside
 
 TIER = "scene"

@@ -13,14 +13,14 @@ from poses import tilted_poses
 
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add
-from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import Selection
 from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result, nothing_found
 from piccolo.judge.result_parts import Alternative
 from piccolo.localization.judging import Found
-from piccolo.panorama import Panorama
+from piccolo.photo.panorama import Panorama
+from piccolo.system.jobs.threads import Stopwatch, Workers
 from piccolo.together import bundle_search
 from piccolo.together.bundle import (
     NOT_FOUND,

@@ -15,7 +15,7 @@ from piccolo.apps.export.formats import export
 from piccolo.apps.export.posed_images import Options
 from piccolo.cli.localize import main
 from piccolo.geometry.pose import Pose, exp_so3
-from piccolo.photo import Photo
+from piccolo.photo.photo import Photo
 from research.scene import read_scene
 
 TIER = "scene"

@@ -15,12 +15,12 @@ import pytest
 from refusals import fill_disk
 
 from piccolo.cli import terminal
-from piccolo.files import cache
-from piccolo.files.atomic import PREFIX, replacing, temporary_folder
-from piccolo.kernels import jit
-from piccolo.kernels.jit import kernel
 from piccolo.optimize.channel_loss import add_channels
 from piccolo.optimize.sampling_loss import add_packed
+from piccolo.system.files import cache
+from piccolo.system.files.atomic import PREFIX, replacing, temporary_folder
+from piccolo.system.kernels import jit
+from piccolo.system.kernels.jit import kernel
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -288,7 +288,7 @@ def test_importing_writes_nothing(tmp_path):
 
 HOLD = """
 import sys, time
-from piccolo.files.atomic import temporary_folder
+from piccolo.system.files.atomic import temporary_folder
 with temporary_folder() as folder:
     (folder / "frame.jpg").touch()
     print(folder, flush=True)

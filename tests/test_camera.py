@@ -12,14 +12,14 @@ from pictures import encoded, write
 from refusals import assert_input_error, assert_refused
 from rooms import room
 
-from piccolo.camera import Camera, Mount
-from piccolo.camera.model import CUT_SPHERE, MODELS, camera_of_fov, pinhole
-from piccolo.camera.resampling import MAX_REMAP_SIDE, View, make_sphere, shrunk, sphere_width
-from piccolo.errors import InputError
 from piccolo.geometry.pose import OPTICAL_FROM_CAM, exp_so3
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.jobs.threads import Workers
-from piccolo.panorama import read_panorama
+from piccolo.photo.camera import Camera, Mount
+from piccolo.photo.camera.model import CUT_SPHERE, MODELS, camera_of_fov, pinhole
+from piccolo.photo.camera.resampling import MAX_REMAP_SIDE, View, make_sphere, shrunk, sphere_width
+from piccolo.photo.panorama import read_panorama
+from piccolo.system.errors import InputError
+from piccolo.system.jobs.threads import Workers
 from research.synthetic.world import make_query, photograph, picture_of_all, pose_of_query, render_picture
 
 SIZE = (1000, 800)

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from refusals import assert_refused, mutated, read_or_refused
 
-from piccolo.camera.calibration import Mount, document_of, read_calibration, read_mounts, read_rig
-from piccolo.camera.model import MODELS, Camera
-from piccolo.camera.resampling import View, make_sphere, sphere_width
-from piccolo.errors import InputError
 from piccolo.geometry.pose import OPTICAL_FROM_CAM, exp_so3, quaternion_wxyz
+from piccolo.photo.camera.calibration import Mount, document_of, read_calibration, read_mounts, read_rig
+from piccolo.photo.camera.model import MODELS, Camera
+from piccolo.photo.camera.resampling import View, make_sphere, sphere_width
+from piccolo.system.errors import InputError
 
 TURN = exp_so3(np.array([0.2, -0.4, 1.1]))
 BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))

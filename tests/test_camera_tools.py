@@ -12,12 +12,12 @@ from rooms import write_room
 from piccolo.api.result_files import read_results
 from piccolo.apps import render_pose
 from piccolo.apps.export import export_poses
-from piccolo.camera import Camera, Mount
-from piccolo.camera.calibration import document_of
-from piccolo.camera.model import pinhole
 from piccolo.cli import localize
 from piccolo.geometry.pose import exp_so3
-from piccolo.jobs.threads import Workers
+from piccolo.photo.camera import Camera, Mount
+from piccolo.photo.camera.calibration import document_of
+from piccolo.photo.camera.model import pinhole
+from piccolo.system.jobs.threads import Workers
 from piccolo.views.pictures import cut, sphere_width_for
 from research.evaluation import evaluate
 from research.scene import read_scene

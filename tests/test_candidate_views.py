@@ -9,9 +9,9 @@ import rooms
 from piccolo.geometry.cone import EVERYWHERE
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
-from piccolo.jobs.threads import Workers
-from piccolo.panorama.local_normalization import LEVELS_PER_UNIT
+from piccolo.photo.panorama.local_normalization import LEVELS_PER_UNIT
 from piccolo.problem.profile import VIEWS
+from piccolo.system.jobs.threads import Workers
 from piccolo.views import points_around
 from piccolo.views.candidate_views import SEARCH_VIEW, CandidateViews, render_views, render_wide
 from piccolo.views.points_around import visible_points

@@ -6,11 +6,19 @@ import naive
 import numpy as np
 import pytest
 
+from piccolo.geometry.levenberg_marquardt import (
+    COUNT_SUM,
+    GRADIENT,
+    LOSS,
+    MATRIX,
+    NUM_SUMS,
+    levenberg_marquardt,
+    retract,
+    solve_damped,
+)
 from piccolo.geometry.pose import Pose, exp_so3, step
 from piccolo.optimize import channel_loss
-from piccolo.optimize.levenberg_marquardt import levenberg_marquardt, retract, solve_damped
-from piccolo.optimize.normal_equations import COUNT_SUM, GRADIENT, LOSS, MATRIX, NUM_SUMS
-from piccolo.panorama.texels import pack_texels
+from piccolo.photo.panorama.texels import pack_texels
 
 TILTED = Pose(exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.2, -0.3, 0.1]))
 SCALE = 60.0

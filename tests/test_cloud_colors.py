@@ -11,7 +11,7 @@ from scans import read_cloud
 
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
 from piccolo.cloud.stream import open_source, stream_of_arrays
-from piccolo.errors import InputError
+from piccolo.system.errors import InputError
 
 RAW = seeded_cloud(5, num_points=1500)
 RGB = ("red", "green", "blue")

@@ -7,7 +7,7 @@ from clouds import whole
 from piccolo.cloud.readers.text_columns import name_columns
 from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.stream import open_source
-from piccolo.errors import InputError
+from piccolo.system.errors import InputError
 
 RNG = np.random.default_rng(3)
 NUM = 1500

@@ -10,13 +10,13 @@ from refusals import assert_refused, mutated, read_or_refused
 from scans import read_cloud
 
 from piccolo.apps import e57_images
-from piccolo.camera.photo_cameras import find_calibration
 from piccolo.cloud.readers import e57_file
 from piccolo.cloud.readers.e57 import list_images, read_image
 from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import open_source
-from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3, quaternion_wxyz
+from piccolo.photo.camera.photo_cameras import find_calibration
+from piccolo.system.errors import InputError
 
 RAW = seeded_cloud(3, num_points=1200)
 R_WORLD = exp_so3(np.array([0.4, -1.1, 2.0]))

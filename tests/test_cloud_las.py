@@ -10,7 +10,7 @@ from refusals import assert_refused
 from piccolo.cloud.readers import las
 from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import open_source
-from piccolo.errors import InputError
+from piccolo.system.errors import InputError
 
 FORMATS = [2, 3, 5, 7, 8, 10]
 EIGHT_BIT = RAW.colors.astype(np.uint16)

@@ -13,9 +13,9 @@ from scipy.spatial import cKDTree
 from piccolo.cloud import octree as octree_module, voxels as voxel_table
 from piccolo.cloud.octree import MAX_NODES, build_octree, collect
 from piccolo.cloud.readers.reader import RawCloud
-from piccolo.errors import InputError
 from piccolo.geometry.cone import EVERYWHERE, Cone
 from piccolo.geometry.pose import rotate_points
+from piccolo.system.errors import InputError
 
 CORNER = -voxel_table.PHASE / voxel_table.QUANTA_PER_METRE
 

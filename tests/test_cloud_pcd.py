@@ -10,7 +10,7 @@ from scans import read_cloud
 from piccolo.cloud.readers import reader as raw
 from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import open_source
-from piccolo.errors import InputError
+from piccolo.system.errors import InputError
 
 
 def write(path, fields, encoding="binary", **options):

@@ -17,7 +17,7 @@ from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
 from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.writers import coordinate_type, vertex_rows, writing_ply
-from piccolo.errors import InputError
+from piccolo.system.errors import InputError
 
 FACES = np.array([([0, 1, 2],), ([2, 3, 4],)], dtype=[("vertex_indices", "i4", (3,))])
 TRIANGLES = PlyElement.describe(FACES, "strip")

@@ -9,7 +9,7 @@ from piccolo.cloud import profiles
 from piccolo.cloud.layers import choose_leaves
 from piccolo.cloud.octree import build_octree
 from piccolo.geometry.pose import exp_so3
-from piccolo.jobs.threads import Workers
+from piccolo.system.jobs.threads import Workers
 
 
 def _corner(count, seed):

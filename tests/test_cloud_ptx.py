@@ -8,7 +8,7 @@ from text_files import RAW, THERE, TWO_SCANS, pts, scan, write_lines
 from piccolo.cloud.readers import text
 from piccolo.cloud.readers.text import line_blocks, open_ptx, open_text
 from piccolo.cloud.stream import open_source
-from piccolo.errors import InputError
+from piccolo.system.errors import InputError
 
 
 def assert_read_as_written(path, raw_cloud=RAW, atol=1e-12):

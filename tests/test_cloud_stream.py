@@ -19,12 +19,12 @@ from piccolo.cloud.readers.reader import PointSource, RawCloud
 from piccolo.cloud.settings import METRES, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.stream import CloudStream, open_cloud, stream_of_arrays
 from piccolo.cloud.voxels import Voxels
-from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3, rotation_to_z
-from piccolo.jobs.threads import Stopwatch, Workers
-from piccolo.paper.localize import PaperSettings
+from piccolo.localization.paper import PaperSettings
 from piccolo.scan_map.open_map import CachePolicy, content_key, open_map
 from piccolo.scan_map.scan_map import prepare_map
+from piccolo.system.errors import InputError
+from piccolo.system.jobs.threads import Stopwatch, Workers
 
 TIER = "scene"
 

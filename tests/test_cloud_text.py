@@ -9,9 +9,10 @@ from scans import read_cloud
 from text_files import lines_of, write_lines
 
 from piccolo.cloud.readers.ply import open_ply
-from piccolo.cloud.readers.text import is_number, open_text
+from piccolo.cloud.readers.text import open_text
 from piccolo.cloud.settings import IN_COLORS
-from piccolo.errors import InputError
+from piccolo.system.errors import InputError
+from piccolo.system.files.json_file import is_number
 
 RAW = seeded_cloud(1)
 

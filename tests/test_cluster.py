@@ -11,7 +11,7 @@ import pytest
 from batches import PAPER, ROOT, start_localize, untimed, wait_for_lines, workers_of
 
 from piccolo.cli import localize
-from piccolo.jobs import cluster
+from piccolo.system.jobs import cluster
 from research.evaluation import evaluate
 
 TIER = "process"

@@ -21,15 +21,15 @@ from piccolo.cli import localize as command_line
 from piccolo.cloud.octree import build_octree, recolor
 from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.writers import vertex_rows, write_colored, writing_e57
-from piccolo.errors import InputError, ResourceError
-from piccolo.files.line_file import Journal
 from piccolo.geometry.pose import Pose, pose_errors, step
-from piccolo.jobs.memory import memory_taken
-from piccolo.jobs.threads import Workers
 from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.judge.result import Result
-from piccolo.panorama import Panorama
+from piccolo.photo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map
+from piccolo.system.errors import InputError, ResourceError
+from piccolo.system.files.line_file import Journal
+from piccolo.system.jobs.memory import memory_taken
+from piccolo.system.jobs.threads import Workers
 from piccolo.together.coloring import alignment, color_scan
 from piccolo.together.coloring.alignment import Anchor, add_pairs, align, balance, look, weigh_points
 from piccolo.together.coloring.color_scan import (

@@ -22,8 +22,8 @@ from piccolo.cli.options import add_arguments
 from piccolo.cli.settings import cloud_settings_from
 from piccolo.cloud.settings import BY_FILE, WITHOUT_COLORS, CloudSettings
 from piccolo.doors import COMMANDS
-from piccolo.errors import InputError, ResourceError, import_optional
 from piccolo.judge.result import Result
+from piccolo.system.errors import InputError, ResourceError, import_optional
 
 TIER = "scene"
 

@@ -17,8 +17,8 @@ from piccolo.judge.candidate import CONTRADICTS, Comparison
 from piccolo.judge.selection import is_mirrored
 from piccolo.localization.mirror import find_mirrored, is_found_again, list_mirrored
 from piccolo.optimize.channel_loss import CHANCE_CORRELATION, NUM_BLOCKS
-from piccolo.panorama import Panorama
-from piccolo.panorama.texels import pack_texels
+from piccolo.photo.panorama import Panorama
+from piccolo.photo.panorama.texels import pack_texels
 from piccolo.problem.method import METHOD
 from research.synthetic.world import mask_outside_field, occlude
 

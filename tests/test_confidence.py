@@ -6,7 +6,6 @@ import rooms
 from made_up import at
 from rooms import as_panorama
 
-from piccolo.errors import InputError
 from piccolo.evidence.occlusion import Agreement, measure_agreement
 from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose import exp_so3, step
@@ -14,8 +13,9 @@ from piccolo.judge import alternatives, probability as rule
 from piccolo.judge.belief import make_belief
 from piccolo.judge.pose_covariance import PoseCovariance, least_constrained_direction
 from piccolo.judge.probability import Standing, classify, posterior
-from piccolo.paper.localize import PaperSettings
+from piccolo.localization.paper import PaperSettings
 from piccolo.problem.settings import CoarseToFineSettings
+from piccolo.system.errors import InputError
 
 SURE = 0.0005  # [rad] largest deviation
 RIGHT, WRONG = Standing(1.0, 0.8, 60, "drawn scan"), Standing(1.0, 0.03, 3, "drawn scan")

@@ -7,9 +7,9 @@ import rooms
 
 from piccolo.geometry.pose import uniform_rotations
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
-from piccolo.jobs.threads import Workers
 from piccolo.localization import correlation
 from piccolo.localization.search import turn_panorama
+from piccolo.system.jobs.threads import Workers
 
 TIER = "scene"
 

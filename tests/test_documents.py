@@ -23,8 +23,8 @@ import piccolo
 from piccolo.api.opening import Cloud
 from piccolo.apps.export.formats import FORMATS as EXPORTS
 from piccolo.cloud.stream import FORMATS
-from piccolo.kernels.jit import COMPILE_TIME
-from piccolo.photo import Photo, Prior
+from piccolo.photo.photo import Photo, Prior
+from piccolo.system.kernels.jit import COMPILE_TIME
 from research.synthetic import make_room
 
 TIER = "process"

@@ -16,16 +16,16 @@ import piccolo
 from piccolo import Pose, Result
 from piccolo.api.result_files import read_results
 from piccolo.cli import localize as localize_command
-from piccolo.cloud.soa import pack_points
+from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import check_pose, exp_so3
 from piccolo.judge import result_parts
 from piccolo.judge.belief import NOTHING, make_belief
 from piccolo.judge.reasons import Reason
 from piccolo.judge.result_parts import Alone, Gap, WalkFrame
-from piccolo.kernels.jit import whole
 from piccolo.optimize.sampling_loss import sampling_loss
-from piccolo.panorama.texels import pack_texels
-from piccolo.photo import GpsPrior
+from piccolo.photo.panorama.texels import pack_texels
+from piccolo.photo.photo import GpsPrior
+from piccolo.system.kernels.jit import whole
 from piccolo.views.zbuffer import nearest_depth, render_view, visible_points
 
 TIER = "scene"

@@ -12,8 +12,8 @@ from piccolo.cloud.octree import build_octree
 from piccolo.evidence import covariance
 from piccolo.evidence.examine import examine
 from piccolo.geometry.pose import exp_so3
-from piccolo.jobs.threads import Workers
 from piccolo.scan_map.scan_map import prepare_map
+from piccolo.system.jobs.threads import Workers
 from piccolo.views.view import Cells
 
 TIER = "scene"

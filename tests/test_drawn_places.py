@@ -6,9 +6,9 @@ import rooms
 from scipy.spatial import cKDTree
 
 from piccolo.geometry.sphere import SEARCH_RINGS, make_grid
-from piccolo.jobs.threads import Workers
 from piccolo.scan_map import drawn_places
 from piccolo.scan_map.drawn_places import DrawnPlaces, cell_table, choose_positions, draw_around
+from piccolo.system.jobs.threads import Workers
 
 TIER = "scene"
 

@@ -13,9 +13,9 @@ from poses import result, write_results
 from rooms import write_room
 
 from piccolo.batch.localizer import Localizer
-from piccolo.jobs import memory
 from piccolo.judge.result_parts import Source
-from piccolo.panorama import picture
+from piccolo.photo.panorama import picture
+from piccolo.system.jobs import memory
 from research.evaluation import evaluate
 from research.evaluation.query_result import read_run
 from research.scene import Query, read_scene, write_queries

@@ -10,10 +10,10 @@ import pytest
 from poses import result
 from refusals import assert_input_error, assert_refused
 
-from piccolo.errors import InputError
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.judge.result_parts import Alone, WalkFrame
+from piccolo.system.errors import InputError
 from research.evaluation import tables
 from research.evaluation.query_result import (
     PAPER_THRESHOLDS,

@@ -8,10 +8,10 @@ from refusals import assert_input_error
 
 from piccolo.apps.export.formats import export
 from piccolo.apps.export.posed_images import Options
-from piccolo.camera import Camera, Mount
-from piccolo.camera.model import pinhole
-from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3, log_so3
+from piccolo.photo.camera import Camera, Mount
+from piccolo.photo.camera.model import pinhole
+from piccolo.system.errors import InputError
 
 POSES = tilted_poses(4)
 TOLERANCE = 1e-6  # px

@@ -13,9 +13,9 @@ from refusals import assert_input_error, mutated, read_or_refused
 
 from piccolo.apps.export.formats import export
 from piccolo.apps.export.posed_images import Options
-from piccolo.errors import InputError
-from piccolo.panorama import panorama_size
-from piccolo.panorama.gpano import EMPTY_PACKET, SCAN, jpeg_segments, with_pose, without_pose
+from piccolo.photo.panorama import panorama_size
+from piccolo.photo.panorama.gpano import EMPTY_PACKET, SCAN, jpeg_segments, with_pose, without_pose
+from piccolo.system.errors import InputError
 
 ANGLES = (123.25, -10.5, 7.0)
 XMP_MARK = b"http://ns.adobe.com/xap/1.0/\0"

@@ -13,11 +13,11 @@ from refusals import assert_input_error
 
 from piccolo.apps.export.formats import export
 from piccolo.apps.export.posed_images import Options
-from piccolo.camera import Camera, Mount
-from piccolo.camera.calibration import read_cameras
-from piccolo.cloud.soa import LocalCloud, pack_points
+from piccolo.geometry.points import LocalCloud, pack_points
 from piccolo.geometry.pose import Pose, exp_so3, uniform_rotations
 from piccolo.geometry.sphere import pixel_rays
+from piccolo.photo.camera import Camera, Mount
+from piccolo.photo.camera.calibration import read_cameras
 
 SIZE = (512, 256)
 FACE = 162  # px

@@ -12,11 +12,11 @@ from rerun.chunk import RrdReader
 from piccolo.apps.export import rerun_file
 from piccolo.apps.export.formats import export
 from piccolo.apps.export.posed_images import Options
-from piccolo.camera import Camera, Mount
-from piccolo.cloud.soa import LocalCloud, pack_points
+from piccolo.geometry.points import LocalCloud, pack_points
 from piccolo.geometry.pose import Pose, exp_so3, uniform_rotations
 from piccolo.judge.belief import make_belief
 from piccolo.judge.result_parts import Source
+from piccolo.photo.camera import Camera, Mount
 
 ORIGIN = np.array([500_000.0, 5_400_000.0, 300.0])
 POSE = Pose(exp_so3(np.array([0.3, -0.2, 1.0])), ORIGIN + np.array([0.2, 0.1, 0.0]))

@@ -12,9 +12,9 @@ from refusals import assert_input_error
 
 from piccolo.apps.export.formats import export
 from piccolo.apps.export.posed_images import Options
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, heading_pitch_roll_deg, rotation_from_quaternion_wxyz
 from piccolo.judge.result_parts import Gap, Source, WalkFrame
+from piccolo.system.errors import InputError
 
 POSES = tilted_poses(4)
 EYE = np.eye(3)

@@ -17,8 +17,8 @@ from piccolo.api.result_files import read_results
 from piccolo.apps.export import export_poses
 from piccolo.apps.export.formats import FORMATS
 from piccolo.apps.export.posed_images import select
-from piccolo.errors import InputError
 from piccolo.judge.result_parts import Source
+from piccolo.system.errors import InputError
 from research.datasets.generic import _table
 
 POSES = tilted_poses(5)

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from poses import judged
 
-from piccolo.camera import Mount
-from piccolo.camera.model import pinhole
 from piccolo.geometry.pose import Pose
 from piccolo.judge.belief import make_belief
 from piccolo.judge.conclude import follow_consensus
@@ -16,6 +14,8 @@ from piccolo.judge.consensus import WRONG_SHARE, Consensus, Opinion
 from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result
 from piccolo.judge.result_parts import FocalLength, Source
+from piccolo.photo.camera import Mount
+from piccolo.photo.camera.model import pinhole
 from piccolo.together.second_looks import follow_cameras, list_looks_by_focal
 
 GIVEN = 700.0

@@ -11,15 +11,11 @@ from pictures import encoded, write
 from poses import judged
 
 import piccolo
-from piccolo.camera import Calibration, Camera, Mount
-from piccolo.camera.model import pinhole
-from piccolo.camera.resampling import View, make_sphere
 from piccolo.evidence import focal_length as focal
 from piccolo.evidence.examine import examine
 from piccolo.evidence.lens_matches import fit_matches
 from piccolo.evidence.self_calibration import Estimate
 from piccolo.geometry.pose import Pose, yaw_rotation
-from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import Selection
 from piccolo.judge.claim import Told
@@ -28,9 +24,13 @@ from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import localize as module
 from piccolo.localization.calibration import follow_matches, recalibrate
 from piccolo.localization.localize import select_likeliest
-from piccolo.panorama import read_panorama
-from piccolo.photo import Photo
+from piccolo.photo.camera import Calibration, Camera, Mount
+from piccolo.photo.camera.model import pinhole
+from piccolo.photo.camera.resampling import View, make_sphere
+from piccolo.photo.panorama import read_panorama
+from piccolo.photo.photo import Photo
 from piccolo.problem.method import METHOD
+from piccolo.system.jobs.threads import Workers
 from research.synthetic.world import render_picture
 
 TIER = "scene"

@@ -17,9 +17,9 @@ from piccolo.apps.export.formats import export
 from piccolo.apps.export.posed_images import Options
 from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.writers import vertex_rows, write_colored
-from piccolo.errors import import_optional, text_of
-from piccolo.files import atomic
-from piccolo.panorama.video import frames_at
+from piccolo.photo.panorama.video import frames_at
+from piccolo.system.errors import import_optional, text_of
+from piccolo.system.files import atomic
 from research.synthetic.walk_frames import writing_video
 from research.synthetic.world import Photo, write_photo
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from poses import covariance, tilted_poses
 
+from piccolo.geometry.gauss_newton import Equations, minimize, sum_observations, whiten
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
 from piccolo.geometry.pose_gaussian import add, differentiate_rays, subtract
 from piccolo.geometry.robust import redescend
-from piccolo.optimize.gauss_newton import Equations, minimize, sum_observations, whiten
 
 LIMIT = 9.0
 robustly = partial(redescend, limit=LIMIT)

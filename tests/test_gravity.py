@@ -6,10 +6,10 @@ import rooms
 from rooms import room
 from scans import bare_room
 
+from piccolo.cloud import gravity as alignment
+from piccolo.cloud.gravity import Planes
 from piccolo.cloud.octree import build_octree
 from piccolo.geometry.pose import exp_so3, rotation_to_z, yaw_rotation
-from piccolo.gravity import alignment
-from piccolo.gravity.alignment import Planes
 
 Z = np.array([0.0, 0.0, 1.0])
 TURNS = [np.array(w) for w in ([0.3, -0.2, 0.9], [1.4, 0.6, -0.3], [2.9, -0.5, 0.4])]

@@ -13,12 +13,12 @@ from made_up import make_candidate
 
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian
-from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import NO_CANDIDATE
 from piccolo.judge.result import nothing_found
 from piccolo.local_features.keypoints import Keypoints
-from piccolo.panorama import Panorama
+from piccolo.photo.panorama import Panorama
+from piccolo.system.jobs.threads import Stopwatch, Workers
 from piccolo.together import group
 from piccolo.together.bundle_search import Support
 from piccolo.together.group import Expected, localize_group, weigh_supports

@@ -12,10 +12,10 @@ from pictures import encoded, write
 from services import serving
 
 from piccolo.api.result_files import read_results
-from piccolo.camera import Mount
-from piccolo.camera.model import pinhole
 from piccolo.cli.localize import main
-from piccolo.panorama.video import choose_distinct
+from piccolo.photo.camera import Mount
+from piccolo.photo.camera.model import pinhole
+from piccolo.photo.panorama.video import choose_distinct
 from research.synthetic.walk_frames import writing_video
 from research.synthetic.world import render_picture
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from piccolo.camera.model import camera_of_fov
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, angle_between
-from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.result import nothing_found
+from piccolo.photo.camera.model import camera_of_fov
+from piccolo.system.errors import InputError
+from piccolo.system.jobs.threads import Workers
 from piccolo.together.group import Grouped
 from research.measuring import benchmark, groups
 from research.synthetic import handheld

@@ -13,9 +13,9 @@ from batches import PAPER, start_localize, untimed, wait_for_lines, workers_of
 from piccolo.api.result_files import read_results
 from piccolo.batch.localizer import Localizer
 from piccolo.cli import execution, localize, settings
-from piccolo.jobs.memory import memory_taken
-from piccolo.jobs.threads import num_cores
 from piccolo.judge.result import Result
+from piccolo.system.jobs.memory import memory_taken
+from piccolo.system.jobs.threads import num_cores
 
 TIER = "process"
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from piccolo.files.atomic import hold_lock, write_atomically
-from piccolo.kernels import ahead
-from piccolo.kernels.jit import kernel
+from piccolo.system.files.atomic import hold_lock, write_atomically
+from piccolo.system.kernels import ahead
+from piccolo.system.kernels.jit import kernel
 
 TIER = "process"
 
@@ -22,7 +22,7 @@ ASKING = r"""
 import sys
 from numba.core.dispatcher import Dispatcher
 from piccolo.cli.start import run
-from piccolo.kernels import ahead, jit
+from piccolo.system.kernels import ahead, jit
 
 asked = []
 within = []
@@ -64,7 +64,7 @@ def test_the_list_has_what_photos_ask_for():
     assert ended.returncode == 0
     asked = ended.stderr.splitlines()
     missing = sorted(set(asked) - set(ahead.LISTED.read_text().splitlines()))
-    assert not missing, "add these lines to piccolo/kernels/signatures.txt"
+    assert not missing, "add these lines to piccolo/system/kernels/signatures.txt"
     assert len(asked) > 25
 
 
@@ -118,8 +118,8 @@ def test_helpers_compile_what_nobody_has_begun(folder):
 
 
 def test_types_that_kernels_take_are_read_as_they_are_written():
-    text = "float32[2C] float64[3A] int64 bool (float32[1C] float32[1C]) piccolo.panorama.texels.Texels("
-    text += "int32[1C] int64 float64)"
+    text = "float32[2C] float64[3A] int64 bool (float32[1C] float32[1C]) "
+    text += "piccolo.photo.panorama.texels.Texels(int32[1C] int64 float64)"
     assert " ".join(map(ahead.describe, ahead.parse(text))) == text
 
 
@@ -131,5 +131,5 @@ def test_help_ends_with_the_process_that_asked_for_it():
 
 
 def test_compiling_all_beforehand_ends_well():
-    command = [sys.executable, "-m", "piccolo.kernels.ahead"]
+    command = [sys.executable, "-m", "piccolo.system.kernels.ahead"]
     assert subprocess.run(command, cwd=ROOT, check=False).returncode == 0

@@ -20,11 +20,11 @@ from piccolo.cli import localize, prepare_map
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.stream import open_cloud, open_source
-from piccolo.errors import InputError
 from piccolo.geometry.colors import NUM_COLORS, Labels, label_colors, palette
 from piccolo.judge.result import Result
-from piccolo.panorama import read_panorama
-from piccolo.photo import Photo
+from piccolo.photo.panorama import read_panorama
+from piccolo.photo.photo import Photo
+from piccolo.system.errors import InputError
 from research.evaluation import evaluate
 from research.evaluation.query_result import read_run
 from research.scene import read_scene

@@ -14,43 +14,42 @@ from piccolo.scan_map import open_map
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("piccolo", "research")
 
-# A module imports from its own folder or from one further down this list.
-LAYERS = [
-    "research.measuring",
-    "research.experiments",
-    "research.evaluation",
-    "research.datasets",
-    "research.synthetic",
-    "research.scene",
-    "__main__",
-    "doors",
-    "apps",
-    "cli",
-    "batch",
-    "api",
-    "together",
-    "localization",
-    "paper",
-    "evidence",
-    "judge",
-    "problem",
-    "scan_map",
-    "local_features",
-    "gravity",
-    "optimize",
-    "views",
-    "panorama",
-    "photo",
-    "camera",
-    "cloud",
-    "geometry",
-    "kernels",
-    "files",
-    "jobs",
-    "arguments",
-    "errors",
-    "arrays",
-]
+# The highest first. A room is a folder of `piccolo` or of its `apps`, or a module beside such folders. It
+# imports from rooms of lower storeys; from one of its own storey only if BESIDE says why.
+STOREYS = {
+    "doors": ["__main__", "doors"],
+    "apps": ["apps"],
+    "what programs and commands call": ["cli", "batch", "api"],
+    "photos that help each other": ["together"],
+    "method": ["localization", "evidence", "judge", "problem"],
+    "scan and photo": ["scan_map", "local_features", "optimize", "views", "photo", "cloud"],
+    "ground": ["geometry", "system"],
+}
+BESIDE = """
+apps.service -> apps.report: the page that it serves is a report
+cli -> batch: its command localizes batches
+cli -> api: commands call what programs call
+batch -> api: its jobs call what programs call
+localization -> evidence: what is found is examined
+localization -> judge: the search stops when a candidate is sure
+localization -> problem: it solves one
+evidence -> judge: it is gathered in a candidate, which the judge defines
+evidence -> problem: it compares the photo and the map of a problem
+judge -> problem: results repeat what was asked
+scan_map -> views: a map holds views of its scan
+scan_map -> local_features: and keypoints in them
+scan_map -> photo: a prior says which part of a scan is prepared
+scan_map -> cloud: it is made of points
+local_features -> views: keypoints of a scan are found in views of it
+local_features -> cloud: which are drawn of its points
+optimize -> photo: its losses compare a photo with points
+optimize -> views: those that a pose sees
+views -> photo: they are normalised as photos are
+views -> cloud: they are drawn of points
+geometry -> system: types of arrays, flags of kernels
+"""
+RESEARCH = ["measuring", "experiments", "evaluation", "datasets", "synthetic", "scene"]  # the highest first
+MOST_OF_CLI = 12  # rooms that it imports
 
 
 def _module(path):
@@ -66,11 +65,15 @@ def _nodes(path):
     return list(ast.walk(ast.parse(path.read_text())))
 
 
-def _folder(module):
-    """The longest entry of LAYERS that a module belongs to."""
-    name = module.removeprefix("piccolo.")
-    parts = name.split(".")
-    return next(p for p in (".".join(parts[:n]) for n in range(len(parts), 0, -1)) if p in LAYERS)
+def _room(module):
+    """The room of a module of `piccolo`."""
+    parts = module.split(".")[1:]
+    return ".".join(parts[: 2 if parts[0] == "apps" else 1])
+
+
+def _storey(room):
+    """The number of a room's storey, from 0 for the highest."""
+    return next(k for k, rooms in enumerate(STOREYS.values()) if room.split(".")[0] in rooms)
 
 
 def _imported(module):
@@ -94,11 +97,34 @@ def _graph():
     return {module: set(_imported(module)) & modules for module in modules}
 
 
-def test_imports_go_down_the_list():
+def _arrows():
+    """From which rooms to which others modules of `piccolo` import, with the names of these modules."""
+    arrows = {}
+    for module, imported in _graph().items():
+        for other in imported if module.startswith("piccolo.") else ():
+            arrows.setdefault((_room(module), _room(other)), set()).add(f"{module} imports {other}")
+    return {ends: imports for ends, imports in arrows.items() if ends[0] != ends[1]}
+
+
+def test_rooms_import_from_lower_storeys():
+    reasons = dict(line.split(": ") for line in BESIDE.strip().splitlines())
+    arrows = _arrows()
+    for (room, other), imports in arrows.items():
+        assert _storey(room) <= _storey(other), imports
+        assert _storey(room) < _storey(other) or f"{room} -> {other}" in reasons, imports
+    assert [line for line in reasons if tuple(line.split(" -> ")) not in arrows] == []
+
+
+def test_research_imports_downwards():
     for module, imported in _graph().items():
         for other in imported:
-            above, below = LAYERS.index(_folder(module)), LAYERS.index(_folder(other))
-            assert above <= below, f"{module} imports {other}, which is above it"
+            if module.startswith("research.") and other.startswith("research."):
+                above, below = (RESEARCH.index(name.split(".")[1]) for name in (module, other))
+                assert above <= below, f"{module} imports {other}"
+
+
+def test_the_command_line_leans_on_few_rooms():
+    assert len({other for room, other in _arrows() if room == "cli"}) <= MOST_OF_CLI
 
 
 def test_product_and_research_import_no_scripts_and_the_product_no_research():
@@ -126,7 +152,7 @@ def test_only_commands_know_argparse():
     for module, path in MODULES.items():
         imports = [n for n in _nodes(path) if isinstance(n, ast.Import)]
         imports = {a.name for n in imports for a in n.names}
-        assert "argparse" not in imports or _folder(module) == "cli" or module.startswith("research."), module
+        assert "argparse" not in imports or module.startswith(("piccolo.cli.", "research.")), module
 
 
 def test_one_module_makes_statuses():

@@ -11,14 +11,14 @@ from made_up import exact_matches
 
 from piccolo.evidence.contradictions import contradictions
 from piccolo.geometry.pose import Pose, exp_so3
-from piccolo.jobs.threads import Workers
 from piccolo.judge.reasons import explain
 from piccolo.local_features.hypotheses import count_matches, exact_pose, propose_poses, rough_poses
 from piccolo.local_features.matching import match_located, merge_matches
 from piccolo.localization.attempts import search_features
-from piccolo.photo import Prior
+from piccolo.photo.photo import Prior
 from piccolo.problem.photo_images import find_all_around
 from piccolo.problem.settings import CoarseToFineSettings
+from piccolo.system.jobs.threads import Workers
 
 TIER = "scene"
 

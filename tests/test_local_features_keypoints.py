@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 
 from piccolo.geometry.pose import yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.jobs.threads import Workers
 from piccolo.local_features.keypoints import DESCRIPTOR_SIZE, find_keypoints, join_keypoints
 from piccolo.local_features.perspective_view import VIEWS_DEG, cover_sphere
+from piccolo.system.jobs.threads import Workers
 
 WIDTH = rooms.WIDTH
 PIXEL = 2.0 * np.pi / WIDTH  # [rad]

@@ -13,14 +13,14 @@ from rooms import as_panorama, errors, query, room, scan_map
 from threadpoolctl import threadpool_limits
 
 from piccolo.cloud.stream import Cloud, stream_of_arrays
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, uniform_yaws
-from piccolo.jobs.threads import Workers
-from piccolo.photo import Prior
+from piccolo.photo.photo import Prior
 from piccolo.problem.prior import allow_rotations, apply_prior
 from piccolo.scan_map import camera_positions
 from piccolo.scan_map.camera_positions import find_supported_cells, heights_above_floor, top_surfaces
 from piccolo.scan_map.scan_map import prepare_map
+from piccolo.system.errors import InputError
+from piccolo.system.jobs.threads import Workers
 
 TIER = "scene"
 

@@ -18,14 +18,14 @@ from piccolo.evidence.examine import examine
 from piccolo.geometry.nearness import ROOM_RANGE
 from piccolo.geometry.pose import Pose, exp_so3, step, yaw_rotation
 from piccolo.geometry.sphere import compute_pixels, pixel_rays
-from piccolo.jobs.threads import Workers
 from piccolo.judge.candidate import Selection, Unoccluded
 from piccolo.judge.pose_covariance import describe_errors
 from piccolo.localization.calibration import calibrate_sphere
 from piccolo.optimize.channel_loss import ChannelProblem
-from piccolo.panorama import Panorama
+from piccolo.photo.panorama import Panorama
 from piccolo.problem.method import METHOD
 from piccolo.scan_map.scan_map import prepare_map
+from piccolo.system.jobs.threads import Workers
 from piccolo.views.view import Cells
 from research.synthetic.places import make_alike
 from research.synthetic.world import World, make_query, scan_world

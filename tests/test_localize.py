@@ -18,13 +18,13 @@ from batches import command_of, start_localize
 from results import RESULT
 from rooms import errors, query
 
-from piccolo.camera import Mount
-from piccolo.camera.model import pinhole
 from piccolo.cli import execution, localize, prepare_map
 from piccolo.judge.belief import make_belief
 from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result
 from piccolo.judge.result_parts import FocalLength
+from piccolo.photo.camera import Mount
+from piccolo.photo.camera.model import pinhole
 from research.scene import read_scene
 
 TIER = "scene"

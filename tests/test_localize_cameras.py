@@ -14,15 +14,15 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 from piccolo.api.result_files import read_results
-from piccolo.camera import Mount
-from piccolo.camera.calibration import document_of, read_rig
-from piccolo.camera.model import Camera, pinhole
 from piccolo.cli.localize import main
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
-from piccolo.jobs.threads import Workers
 from piccolo.judge.result import Result
-from piccolo.panorama import read_panorama
-from piccolo.photo import Photo
+from piccolo.photo.camera import Mount
+from piccolo.photo.camera.calibration import document_of, read_rig
+from piccolo.photo.camera.model import Camera, pinhole
+from piccolo.photo.panorama import read_panorama
+from piccolo.photo.photo import Photo
+from piccolo.system.jobs.threads import Workers
 from research.synthetic.world import photograph, picture_of_all, render_picture
 
 TIER = "scene"

@@ -9,11 +9,11 @@ import pytest
 import rooms
 from scans import read_cloud
 
-from piccolo.cloud.soa import pack_points
+from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import Pose, uniform_yaws
-from piccolo.jobs.threads import Workers
 from piccolo.optimize.sampling_loss import sampling_loss
-from piccolo.panorama.texels import pack_texels
+from piccolo.photo.panorama.texels import pack_texels
+from piccolo.system.jobs.threads import Workers
 from piccolo.views.zbuffer import visible_points
 from research.experiments import loss_surface as tool
 from research.experiments.loss_surface import LossSurface, PoseGrid, loss_surface

@@ -13,13 +13,13 @@ from rooms import make_map, map_path, scan_map
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.voxels import LEAF_SIZE, PHASE, QUANTA_PER_METRE, VoxelTable
-from piccolo.errors import InputError
-from piccolo.files import array_archive
-from piccolo.files.array_archive import ALIGNMENT, ArrayArchive, read_header, write_archive
 from piccolo.geometry.pose import exp_so3
 from piccolo.scan_map import map_file, open_map
 from piccolo.scan_map.map_file import first_misplaced, is_map_file, load_map, save_map
 from piccolo.scan_map.open_map import content_key
+from piccolo.system.errors import InputError
+from piccolo.system.files import array_archive
+from piccolo.system.files.array_archive import ALIGNMENT, ArrayArchive, read_header, write_archive
 
 TIER = "scene"
 

@@ -18,14 +18,14 @@ from rooms import AUTO, as_panorama, ask as ask_photo, query, room, scan_map, st
 
 from piccolo.cloud import octree, voxels as voxels_module
 from piccolo.cloud.stream import stream_of_arrays
-from piccolo.errors import InputError
-from piccolo.jobs import memory, threads
-from piccolo.jobs.threads import Workers
 from piccolo.localization.search import search_poses
-from piccolo.panorama import read_panorama
-from piccolo.panorama.photo import read_photo_facts
-from piccolo.panorama.video import frames_of
+from piccolo.photo.panorama import read_panorama
+from piccolo.photo.panorama.facts import read_photo_facts
+from piccolo.photo.panorama.video import frames_of
 from piccolo.scan_map.scan_map import prepare_map
+from piccolo.system.errors import InputError
+from piccolo.system.jobs import memory, threads
+from piccolo.system.jobs.threads import Workers
 from piccolo.views.candidate_views import SEARCH_VIEW, render_views, render_wide
 
 TIER = "scene"

@@ -11,10 +11,10 @@ import rooms
 from made_up import WHOLE, make_candidate, make_selection
 
 from piccolo.batch.results_file import describe_changes
-from piccolo.errors import InputError
 from piccolo.judge.selection import is_clear, is_sure
 from piccolo.problem.method import METHOD, Method
 from piccolo.problem.settings import CoarseToFineSettings
+from piccolo.system.errors import InputError
 
 TIER = "scene"
 

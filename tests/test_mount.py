@@ -24,7 +24,7 @@ from piccolo.geometry.pose import (
 )
 from piccolo.geometry.pose_gaussian import add, subtract
 from piccolo.judge.pose_covariance import PoseCovariance
-from piccolo.photo import Prior
+from piccolo.photo.photo import Prior
 
 CLOCK = 0.08
 PHOTO = np.repeat([np.radians(0.05), 0.004], 3)  # deviations of a photo's pose

@@ -8,7 +8,6 @@ import rooms
 from groups import SEED, taken_photos
 
 from piccolo.geometry.pose import Pose, pose_errors
-from piccolo.jobs.threads import Stopwatch
 from piccolo.judge.belief import make_belief
 from piccolo.judge.by_others import IS_NEARBY, believe_nearby
 from piccolo.judge.reasons import Reason
@@ -16,6 +15,7 @@ from piccolo.judge.result import nothing_found
 from piccolo.judge.result_parts import Alternative
 from piccolo.localization.means import Means
 from piccolo.scan_map.camera_positions import COARSE_SPACING
+from piccolo.system.jobs.threads import Stopwatch
 from piccolo.together.members import Shot
 from piccolo.together.nearby import REACH, compute_odds_elsewhere, localize_nearby, narrow_around
 

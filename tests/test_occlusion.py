@@ -8,7 +8,7 @@ import rooms
 from piccolo.evidence import occlusion
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.sphere import pixel_rays, solid_angles
-from piccolo.panorama import Panorama
+from piccolo.photo.panorama import Panorama
 
 SEEDS = (1, 2, 3, 4, 5)
 

@@ -10,16 +10,16 @@ from made_up import PROBLEM, make_candidate, make_selection
 from walks import walk_through
 
 import piccolo
-from piccolo.camera import Mount
-from piccolo.camera.model import pinhole
 from piccolo.geometry.pose import Pose, yaw_rotation
-from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.case import UNKNOWN_ERRORS, Case, Geometry, Measured
 from piccolo.judge.conclude import MIRRORED, NOT_AS_CLAIMED
 from piccolo.judge.probability import Standing
 from piccolo.judge.reasons import Reason
 from piccolo.localization import judging
+from piccolo.photo.camera import Mount
+from piccolo.photo.camera.model import pinhole
+from piccolo.system.jobs.threads import Workers
 from research.synthetic.world import photograph, render_picture
 
 TIER = "scene"

@@ -11,11 +11,11 @@ from refusals import assert_input_error, fill_disk
 from rooms import scan_map
 
 from piccolo.cloud.settings import BY_FILE
-from piccolo.files import cache
-from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.scan_map import map_file, open_map
 from piccolo.scan_map.map_file import save_map
 from piccolo.scan_map.open_map import CachePolicy
+from piccolo.system.files import cache
+from piccolo.system.jobs.threads import Stopwatch, Workers
 
 TIER = "scene"
 

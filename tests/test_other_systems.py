@@ -23,7 +23,7 @@ for name in "getuid fchmod fchown pread sched_getaffinity register_at_fork sysco
     delattr(os, name)
 del signal.pthread_sigmask, psutil.RLIMIT_AS
 sys.path.insert(0, {str(ROOT / "tests")!r})
-from piccolo.files import atomic
+from piccolo.system.files import atomic
 atomic.IS_WINDOWS = True
 from batches import work
 os.chdir(sys.argv[1])

@@ -5,10 +5,10 @@ import itertools
 import numpy as np
 import pytest
 
-from piccolo.camera.model import camera_of_fov
 from piccolo.evidence.focal_length import NOT_CALIBRATED
-from piccolo.jobs.threads import Workers
-from piccolo.panorama.cameras import OF_PIXELS
+from piccolo.photo.camera.model import camera_of_fov
+from piccolo.photo.panorama.cameras import OF_PIXELS
+from piccolo.system.jobs.threads import Workers
 from research.measuring import outdoor_trials as trials
 from research.synthetic import outdoor_photos, outdoor_scans as scans, world as worlds
 from research.synthetic.layout import PLAIN, RoomBuilder

@@ -5,10 +5,10 @@ import poselib
 import pytest
 import rooms
 
+from piccolo.geometry.levenberg_marquardt import COUNT_SUM, GRADIENT, LOSS, MATRIX, NUM_SUMS
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors, rotation_from_quaternion_wxyz, step
 from piccolo.local_features.hypotheses import angular_equations, descend_matches
 from piccolo.local_features.p3p import p3p
-from piccolo.optimize.normal_equations import COUNT_SUM, GRADIENT, LOSS, MATRIX, NUM_SUMS
 
 NUM_CASES = 5000
 RESTS = np.array([3.0, -7.0, 1.5])  # [m] the scene's middle, off the origin

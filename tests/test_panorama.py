@@ -9,8 +9,8 @@ from hypothesis import given, settings, strategies as st
 from pictures import PNG_HEADER_SIZE, TURNS, animation, encoded, png_chunk, smooth_rgb, with_metadata, write
 from refusals import assert_refused, mutated, read_or_refused
 
-from piccolo.errors import InputError
-from piccolo.panorama import read_panorama
+from piccolo.photo.panorama import read_panorama
+from piccolo.system.errors import InputError
 
 RGB = smooth_rgb()
 

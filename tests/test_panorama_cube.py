@@ -4,10 +4,10 @@ import pytest
 from pictures import encoded, write
 from refusals import assert_refused
 
-from piccolo.errors import InputError
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.panorama import read_panorama
-from piccolo.photo import Photo
+from piccolo.photo.panorama import read_panorama
+from piccolo.photo.photo import Photo
+from piccolo.system.errors import InputError
 
 SIZE = 64
 # forward, right and up of each face's picture, by hand: +x the panorama's centre, +y left, +z up

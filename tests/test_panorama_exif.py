@@ -11,12 +11,12 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 from refusals import assert_input_error, assert_refused, read_or_refused
 
-from piccolo.camera import Calibration, Camera, Mount
-from piccolo.camera.model import pinhole
-from piccolo.panorama import GPano, read_panorama
-from piccolo.panorama.gpano import attitude_of_gravity, rotation_to_level
-from piccolo.panorama.photo import read_focal_length
-from piccolo.photo import Photo
+from piccolo.photo.camera import Calibration, Camera, Mount
+from piccolo.photo.camera.model import pinhole
+from piccolo.photo.panorama import GPano, read_panorama
+from piccolo.photo.panorama.facts import read_focal_length
+from piccolo.photo.panorama.gpano import attitude_of_gravity, rotation_to_level
+from piccolo.photo.photo import Photo
 
 PHOTO = smooth_rgb(360, 480)
 

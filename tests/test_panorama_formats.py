@@ -26,10 +26,10 @@ from PIL import Image
 from pillow_heif import register_heif_opener
 from refusals import assert_refused, mutated, read_or_refused
 
-from piccolo.panorama import read_panorama
-from piccolo.panorama.photo import read_photo_facts
-from piccolo.panorama.picture import read_picture
-from piccolo.photo import Photo
+from piccolo.photo.panorama import read_panorama
+from piccolo.photo.panorama.facts import read_photo_facts
+from piccolo.photo.panorama.picture import read_picture
+from piccolo.photo.photo import Photo
 
 RGB = smooth_rgb()
 RANDOM16 = np.random.default_rng(3).integers(0, 65536, (64, 128, 4), dtype=np.uint16)

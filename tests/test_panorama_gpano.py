@@ -17,10 +17,10 @@ from pictures import (
 )
 from refusals import assert_refused, read_or_refused
 
-from piccolo.errors import InputError
-from piccolo.panorama import GPano, read_panorama
-from piccolo.panorama.gpano import gpano_fields, rotation_to_level
-from piccolo.photo import Photo
+from piccolo.photo.panorama import GPano, read_panorama
+from piccolo.photo.panorama.gpano import gpano_fields, rotation_to_level
+from piccolo.photo.photo import Photo
+from piccolo.system.errors import InputError
 
 RGB = smooth_rgb(200, 400)
 LOSSLESS = [cv2.IMWRITE_WEBP_QUALITY, 101]

@@ -9,10 +9,10 @@ import pytest
 from pictures import crop_fields, encoded, saved, tiff, with_metadata, write, xmp_packet
 from refusals import assert_refused
 
-from piccolo.errors import InputError
-from piccolo.panorama import read_panorama
-from piccolo.panorama.masks import find_mask, shows_twice
-from piccolo.photo import Photo
+from piccolo.photo.panorama import read_panorama
+from piccolo.photo.panorama.masks import find_mask, shows_twice
+from piccolo.photo.photo import Photo
+from piccolo.system.errors import InputError
 
 WIDTH, HEIGHT = 512, 256
 

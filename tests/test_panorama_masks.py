@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from pictures import crop_fields, encoded, with_metadata, write, xmp_packet
 
-from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3
 from piccolo.geometry.sphere import pixel_rays, solid_angles
-from piccolo.panorama import read_panorama
-from piccolo.panorama.masks import is_dual_fisheye
-from piccolo.photo import Photo
+from piccolo.photo.panorama import read_panorama
+from piccolo.photo.panorama.masks import is_dual_fisheye
+from piccolo.photo.photo import Photo
+from piccolo.system.errors import InputError
 
 WIDTH, HEIGHT = 1024, 512
 

@@ -9,12 +9,10 @@ from golden_poses import check_golden_poses
 from refusals import assert_input_error
 from rooms import as_panorama, errors, query, room
 
-from piccolo.cloud.soa import pack_points
+from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import Pose, uniform_rotations
-from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.judge.result_parts import Evidence
-from piccolo.panorama.model import shrink
-from piccolo.paper.localize import (
+from piccolo.localization.paper import (
     PROBE_WIDTH,
     PaperSettings,
     color_histogram,
@@ -24,7 +22,9 @@ from piccolo.paper.localize import (
     paper_confidence,
     prepare,
 )
+from piccolo.photo.panorama.model import shrink
 from piccolo.scan_map.camera_positions import MIN_CLEARANCE
+from piccolo.system.jobs.threads import Stopwatch, Workers
 from piccolo.views.zbuffer import is_free_space
 
 TIER = "scene"

@@ -9,14 +9,14 @@ import pytest
 import rooms
 from rooms import as_panorama, errors, query, room
 
-from piccolo.cloud.soa import pack_points
-from piccolo.errors import InputError
+from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import Pose, exp_so3, step
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.localization.paper import localize, prepare
 from piccolo.optimize.refine import refine
-from piccolo.panorama.model import shrink
-from piccolo.paper.localize import localize, prepare
+from piccolo.photo.panorama.model import shrink
+from piccolo.system.errors import InputError
+from piccolo.system.jobs.threads import Stopwatch, Workers
 from piccolo.views.zbuffer import View, render_view
 from research.experiments.photometric import (
     PhotometricSettings,

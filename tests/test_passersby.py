@@ -10,8 +10,8 @@ import pytest
 import rooms
 
 from piccolo.cloud.octree import build_octree
-from piccolo.jobs.threads import Workers
-from piccolo.panorama import Panorama
+from piccolo.photo.panorama import Panorama
+from piccolo.system.jobs.threads import Workers
 from piccolo.together.coloring import alignment, passersby
 from piccolo.together.coloring.alignment import Sightings
 from piccolo.together.coloring.color_scan import make_brushes, paint_points

@@ -10,9 +10,9 @@ import pytest
 from refusals import assert_refused
 
 from piccolo import Photo
-from piccolo.camera.photo_cameras import find_calibration, open_calibration
-from piccolo.panorama import read_panorama
-from piccolo.panorama.cube import is_cube
+from piccolo.photo.camera.photo_cameras import find_calibration, open_calibration
+from piccolo.photo.panorama import read_panorama
+from piccolo.photo.panorama.cube import is_cube
 
 NAMES = ["left/a.jpg", "left/b.jpg", "right/a.jpg", "right/b.jpg"]
 FOCALS = [500.0, 501.0, 502.0, 503.0]

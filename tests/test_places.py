@@ -7,7 +7,7 @@ import pytest
 import rooms
 
 from piccolo.geometry.sphere import pixel_rays, solid_angles
-from piccolo.jobs.threads import Workers
+from piccolo.system.jobs.threads import Workers
 from research.measuring import confidence
 from research.measuring.confidence import remove_texture
 from research.synthetic.layout import PLAIN

@@ -17,8 +17,8 @@ import piccolo
 from piccolo.batch.inputs import read_priors
 from piccolo.cloud.settings import CloudSettings, from_wgs84
 from piccolo.cloud.stream import read_crs
-from piccolo.panorama.photo import GpsPosition, PhotoFacts, read_photo_facts
-from piccolo.photo import Photo, Prior
+from piccolo.photo.panorama.facts import GpsPosition, PhotoFacts, read_photo_facts
+from piccolo.photo.photo import Photo, Prior
 
 TIER = "scene"
 

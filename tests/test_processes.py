@@ -11,8 +11,8 @@ from functools import partial
 import pytest
 from batches import ROOT
 
-from piccolo.errors import InputError
-from piccolo.jobs.processes import IN_FLIGHT, LIBRARIES, Here, Processes, WorkerLostError
+from piccolo.system.errors import InputError
+from piccolo.system.jobs.processes import IN_FLIGHT, LIBRARIES, Here, Processes, WorkerLostError
 
 TIER = "process"
 

@@ -14,7 +14,6 @@ from piccolo.geometry.cone import EVERYWHERE
 from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose import Pose, step
 from piccolo.geometry.sphere import make_grid
-from piccolo.jobs.threads import Workers
 from piccolo.judge.candidate import CONTRADICTS, Comparison
 from piccolo.localization import beam, ladder
 from piccolo.localization.beam import best_and_alternatives, narrow
@@ -23,6 +22,7 @@ from piccolo.optimize.channel_loss import NUM_BLOCKS
 from piccolo.problem.method import METHOD
 from piccolo.problem.profile import VIEWS, WHOLE_BEAM
 from piccolo.problem.stages import AROUND_FINE, AROUND_MIDDLE, FULL, LAST, NEARLY, SECOND, Limits, Rounds
+from piccolo.system.jobs.threads import Workers
 from piccolo.views.points_around import round_position
 from piccolo.views.view import Cells
 

@@ -28,9 +28,9 @@ from report_scenes import (
 import piccolo
 from piccolo.apps.report import report
 from piccolo.apps.report.pictures import pack_depth
-from piccolo.errors import InputError
 from piccolo.judge.belief import make_belief
 from piccolo.judge.reasons import Reason
+from piccolo.system.errors import InputError
 from research.synthetic.walk_frames import writing_video
 
 TIER = "scene"

@@ -14,7 +14,7 @@ from report_scenes import HOSTILE, House, lifted
 from piccolo.apps.report import report
 from piccolo.apps.report.pictures import PIXEL, plan_matrix, read_control_points
 from piccolo.apps.report.plan_file import COLORS, DPI, color_of, segments_of
-from piccolo.errors import InputError
+from piccolo.system.errors import InputError
 
 TIER = "scene"
 

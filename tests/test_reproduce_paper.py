@@ -10,12 +10,12 @@ import pytest
 from rooms import write_room
 from scans import read_cloud
 
-from piccolo.cloud.soa import pack_points
+from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import Pose, angle_between
+from piccolo.localization.paper import PaperSettings
 from piccolo.optimize.sampling_loss import sampling_loss
-from piccolo.panorama import read_panorama
-from piccolo.panorama.texels import pack_texels
-from piccolo.paper.localize import PaperSettings
+from piccolo.photo.panorama import read_panorama
+from piccolo.photo.panorama.texels import pack_texels
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.views.zbuffer import visible_points
 from research.evaluation.query_result import read_run

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from piccolo.geometry import robust
-from piccolo.kernels.jit import kernel
+from piccolo.system.kernels.jit import kernel
 
 SQUARES = np.array([0.3, 2.0, 5.9, 6.1, 40.0, 1e4])
 

@@ -4,10 +4,10 @@ import naive
 import numpy as np
 import pytest
 
-from piccolo.cloud.soa import pack_points
+from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import Pose, exp_so3, step, yaw_rotation
 from piccolo.optimize.sampling_loss import POINTS_A_SUM, sampling_equations, sampling_loss
-from piccolo.panorama.texels import pack_texels
+from piccolo.photo.panorama.texels import pack_texels
 
 WIDTH = 256
 CENTER = np.array([0.2, -0.3, 0.1])

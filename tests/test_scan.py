@@ -11,12 +11,12 @@ import rooms
 from refusals import assert_input_error
 
 import piccolo
-from piccolo.errors import InputError
-from piccolo.files.cache import sha256_of_arrays
 from piccolo.geometry.pose import heading_pitch_roll_deg
-from piccolo.paper.localize import PaperSettings
-from piccolo.photo import Prior
+from piccolo.localization.paper import PaperSettings
+from piccolo.photo.photo import Prior
 from piccolo.problem.settings import CoarseToFineSettings
+from piccolo.system.errors import InputError
+from piccolo.system.files.cache import sha256_of_arrays
 
 TIER = "scene"
 

@@ -14,17 +14,17 @@ from scipy.spatial import cKDTree
 from piccolo.cli import localize as localize_command, prepare_map as prepare_command
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import LEAF_SIZE, VoxelTable, join_voxels
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose
-from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization.localize import localize
 from piccolo.localization.places import add_places
-from piccolo.photo import Prior
+from piccolo.photo.photo import Prior
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.scan_map.camera_positions import MIN_CLEARANCE
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_addition import add_scan
 from piccolo.scan_map.scan_map import find_scan_at, name_scan, prepare_map
+from piccolo.system.errors import InputError
+from piccolo.system.jobs.threads import Stopwatch, Workers
 from piccolo.views.candidate_views import SEARCH_VIEW, WideViews, render_wide
 
 TIER = "scene"

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from refusals import assert_input_error, assert_refused
 
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
+from piccolo.system.errors import InputError
 from research.scene import Query, find_scenes, read_scene, write_queries
 
 pytestmark = pytest.mark.research

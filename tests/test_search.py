@@ -10,17 +10,17 @@ from pictures import encoded, with_metadata, xmp_packet
 
 from piccolo.geometry.pose import angle_between, exp_so3, uniform_rotations, uniform_yaws
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
-from piccolo.jobs.threads import Workers
 from piccolo.localization import attempts, search
-from piccolo.panorama import Panorama, read_panorama
-from piccolo.panorama.gpano import GPano
-from piccolo.panorama.local_normalization import normalize_panorama, sample_channels
-from piccolo.panorama.model import resize
-from piccolo.photo import Photo, Prior
+from piccolo.photo.panorama import Panorama, read_panorama
+from piccolo.photo.panorama.gpano import GPano
+from piccolo.photo.panorama.local_normalization import normalize_panorama, sample_channels
+from piccolo.photo.panorama.model import resize
+from piccolo.photo.photo import Photo, Prior
 from piccolo.problem.method import METHOD
 from piccolo.problem.photo_images import make_images
 from piccolo.problem.profile import ImageScales
 from piccolo.problem.settings import Effort
+from piccolo.system.jobs.threads import Workers
 from research.synthetic.world import mask_outside_field
 
 TIER = "scene"

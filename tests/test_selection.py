@@ -10,7 +10,6 @@ from made_up import PARTIAL, PROBLEM, WHOLE, make_candidate, make_selection, pla
 
 from piccolo.evidence.examine import complete, count_agreeing, examine
 from piccolo.geometry.pose import step
-from piccolo.jobs.threads import Workers
 from piccolo.judge.candidate import Selection
 from piccolo.judge.probability import Standing
 from piccolo.judge.result import nothing_found
@@ -22,8 +21,9 @@ from piccolo.localization.copies import put_first
 from piccolo.localization.judging import Found, judge
 from piccolo.localization.ladder import FINE, refine
 from piccolo.localization.last_descent import refine_best
-from piccolo.panorama.texels import pack_texels
+from piccolo.photo.panorama.texels import pack_texels
 from piccolo.problem.settings import CoarseToFineSettings
+from piccolo.system.jobs.threads import Workers
 
 TIER = "scene"
 

@@ -12,9 +12,6 @@ from rooms import as_panorama
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from piccolo.camera import Camera, Mount
-from piccolo.camera.corrections import Corrections
-from piccolo.camera.model import pinhole, whole_sphere
 from piccolo.evidence.self_calibration import Estimate, FreeEnd, displace_blocks
 from piccolo.evidence.sphere import CLAIM, SphereFit, count_deviations
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
@@ -24,7 +21,10 @@ from piccolo.judge.claim import Claim, Told, marginal
 from piccolo.judge.result import Result
 from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.optimize.self_calibration import sum_free_equations
-from piccolo.panorama.texels import pack_texels
+from piccolo.photo.camera import Camera, Mount
+from piccolo.photo.camera.corrections import Corrections
+from piccolo.photo.camera.model import pinhole, whole_sphere
+from piccolo.photo.panorama.texels import pack_texels
 
 TIER = "scene"
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from piccolo.api.second_look import take_surer
-from piccolo.camera import Mount
-from piccolo.camera.model import pinhole
 from piccolo.geometry.pose import Pose
 from piccolo.judge.result import Result
 from piccolo.judge.result_parts import Beside, FocalLength, Source
+from piccolo.photo.camera import Mount
+from piccolo.photo.camera.model import pinhole
 from piccolo.together.second_looks import follow, list_looks_beside, list_looks_together
 from piccolo.together.series import MOST_IN_SERIES, list_series
 

@@ -22,7 +22,7 @@ from piccolo.apps.service.asking import clean_name
 from piccolo.apps.service.description import describe_service
 from piccolo.cli import localize
 from piccolo.judge.result import Result
-from piccolo.photo import Photo, Prior
+from piccolo.photo.photo import Photo, Prior
 
 TIER = "process"
 

@@ -23,20 +23,20 @@ from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_COLORS, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.stream import open_cloud, stream_of_arrays
 from piccolo.cloud.surfaces import paint_shape
-from piccolo.errors import InputError
 from piccolo.evidence.examine import complete, examine
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.sphere import compute_indices, pixel_rays
-from piccolo.jobs.threads import Workers
 from piccolo.judge.probability import log_odds
 from piccolo.judge.selection import assess_alone
 from piccolo.localization import localize as method
 from piccolo.localization.shape import align_lines
-from piccolo.panorama import Panorama
-from piccolo.panorama.edges import draw_edges, find_axes, soften
+from piccolo.photo.panorama import Panorama
+from piccolo.photo.panorama.edges import draw_edges, find_axes, soften
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_map import SHAPE_ALONE, prepare_map
+from piccolo.system.errors import InputError
+from piccolo.system.jobs.threads import Workers
 from research.synthetic.places import make_alike
 from research.synthetic.world import World, make_query, scan_world
 

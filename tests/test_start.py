@@ -40,7 +40,7 @@ def _prepare(scene, out, *more):
 
 COUNT_ARENAS = """
 import ctypes, sys, threading
-from piccolo.jobs.memory import share_arenas
+from piccolo.system.jobs.memory import share_arenas
 share_arenas()
 barrier = threading.Barrier(6)
 def allocate():

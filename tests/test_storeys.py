@@ -7,10 +7,10 @@ from rooms import scan_map
 
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.stream import stream_of_arrays
-from piccolo.jobs.threads import Workers
 from piccolo.scan_map.camera_positions import FreeSpace
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scan_map.storeys import Storey, find_storeys
+from piccolo.system.jobs.threads import Workers
 from research.synthetic.world import make_world, scan_world
 
 TIER = "scene"

@@ -12,8 +12,7 @@ from hypothesis import given, settings, strategies as st
 from refusals import mutated, read_or_refused
 
 from piccolo.apps.render_pose import read_pose_matrix
-from piccolo.cloud.soa import LocalCloud, pack_points
-from piccolo.errors import InputError
+from piccolo.geometry.points import LocalCloud, pack_points
 from piccolo.geometry.pose import (
     Pose,
     R_cam_from_angles,
@@ -23,7 +22,8 @@ from piccolo.geometry.pose import (
     step,
 )
 from piccolo.geometry.sphere import compute_pixels, pixel_rays
-from piccolo.jobs.threads import Workers
+from piccolo.system.errors import InputError
+from piccolo.system.jobs.threads import Workers
 from piccolo.views.pictures import encode_image, fill_holes
 from piccolo.views.surfels import (
     BAND_OFFSET,

@@ -13,7 +13,6 @@ import pytest
 import rooms
 from scans import read_cloud
 
-from piccolo.errors import InputError
 from piccolo.geometry.pose import (
     OPTICAL_FROM_CAM,
     Pose,
@@ -22,7 +21,8 @@ from piccolo.geometry.pose import (
     yaw_rotation,
 )
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.jobs.threads import Workers
+from piccolo.system.errors import InputError
+from piccolo.system.jobs.threads import Workers
 from research.scene import read_scene
 from research.synthetic import make_room as tool
 from research.synthetic.layout import make_room

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tiers
 
-from piccolo.paper.localize import PaperMap
+from piccolo.localization.paper import PaperMap
 
 TIER = "process"
 

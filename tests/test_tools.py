@@ -17,8 +17,8 @@ from rooms import write_room
 from piccolo.geometry.pose import Pose
 from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.judge.result import Result
-from piccolo.panorama import read_panorama
-from piccolo.paper.localize import PaperSettings
+from piccolo.localization.paper import PaperSettings
+from piccolo.photo.panorama import read_panorama
 from piccolo.problem.method import METHOD
 from research.evaluation.query_result import QueryResult
 from research.measuring import benchmark, confidence, page, sensitivity, speed

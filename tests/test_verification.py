@@ -22,7 +22,6 @@ from piccolo.geometry.nearness import ROOM_RANGE
 from piccolo.geometry.pose import MAX_DISTANCE, Pose, exp_so3, log_so3, step, yaw_rotation
 from piccolo.geometry.pose_gaussian import LIKELY, subtract
 from piccolo.geometry.sphere import compute_indices
-from piccolo.jobs.threads import Workers
 from piccolo.judge.candidate import Drawn
 from piccolo.local_features import matching
 from piccolo.local_features.hypotheses import count_matches
@@ -30,11 +29,12 @@ from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization.copies import list_copies
 from piccolo.localization.judging import Found, judge
 from piccolo.optimize.sampling_loss import sampling_loss
-from piccolo.panorama import Panorama
-from piccolo.photo import Prior
+from piccolo.photo.panorama import Panorama
+from piccolo.photo.photo import Prior
 from piccolo.problem.method import METHOD
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.scan_map.scan_map import prepare_map
+from piccolo.system.jobs.threads import Workers
 from piccolo.together import bundle_search
 from piccolo.together.bundle_search import find_supports
 from piccolo.together.members import Member

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from refusals import assert_input_error
 
-from piccolo.panorama.picture import read_picture
-from piccolo.panorama.video import frames_at, frames_of, frames_of_chapters
+from piccolo.photo.panorama.picture import read_picture
+from piccolo.photo.panorama.video import frames_at, frames_of, frames_of_chapters
 from research.synthetic.walk_frames import writing_video
 
 MATRICES = {  # of the track, by the turn to the right that players make [deg]

@@ -8,8 +8,8 @@ from piccolo.cloud.octree import build_octree
 from piccolo.geometry.colors import unpack_rgb
 from piccolo.geometry.cone import EVERYWHERE
 from piccolo.geometry.sphere import find_cell, make_grid
-from piccolo.jobs.threads import Workers
 from piccolo.scan_map import camera_positions
+from piccolo.system.jobs.threads import Workers
 from piccolo.views import view
 from piccolo.views.candidate_views import SEARCH_VIEW
 from piccolo.views.points_around import points_around, take_children, visible_points

@@ -11,7 +11,7 @@ from walks import NUM_FRAMES, SEED, assert_right, list_frames, write_walk
 import piccolo
 from piccolo.geometry.pose import pose_errors
 from piccolo.judge.result import nothing_found
-from piccolo.photo import Photo
+from piccolo.photo.photo import Photo
 from piccolo.together.walk import tracker as tracker_module
 
 TIER = "scene"

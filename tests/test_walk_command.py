@@ -16,10 +16,10 @@ from piccolo.api.scan_walk import Walk
 from piccolo.apps.export.formats import tum_lines
 from piccolo.batch.jobs import steps_file
 from piccolo.cli import localize
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, carry, yaw_rotation
-from piccolo.jobs import memory
-from piccolo.panorama import picture
+from piccolo.photo.panorama import picture
+from piccolo.system.errors import InputError
+from piccolo.system.jobs import memory
 from research.synthetic.walk_frames import writing_video
 
 TIER = "scene"

@@ -14,16 +14,16 @@ from poses import judged
 from refusals import assert_input_error
 
 from piccolo.batch.inputs import times_of
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
 from piccolo.geometry.pose_gaussian import PoseGaussian
 from piccolo.judge.belief import make_belief
 from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result, nothing_found
 from piccolo.judge.result_parts import Alternative, Evidence
-from piccolo.photo import Photo
+from piccolo.photo.photo import Photo
 from piccolo.problem.accuracy import PAPER_ACCURACY, Accuracy
 from piccolo.problem.settings import CoarseToFineSettings
+from piccolo.system.errors import InputError
 from piccolo.together.walk.frames import MOST_ODDS, Frame, State, list_states
 from piccolo.together.walk.path import NOTHING, Ranked
 from piccolo.together.walk.results import check_odometry, make_localization, smooth_positions

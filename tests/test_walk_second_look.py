@@ -7,10 +7,10 @@ import pytest
 from key_frames import make_followed
 
 from piccolo.geometry.pose import Pose
-from piccolo.jobs.threads import no_progress
 from piccolo.judge.result import Result
 from piccolo.problem.accuracy import PAPER_ACCURACY
 from piccolo.problem.settings import CoarseToFineSettings
+from piccolo.system.jobs.threads import no_progress
 from piccolo.together.walk import path as walk_path, second_look
 from piccolo.together.walk.frames import Frame, Motion, State
 from piccolo.together.walk.path import NOTHING, Ranked, believe

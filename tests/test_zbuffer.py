@@ -2,7 +2,7 @@ import naive
 import numpy as np
 import pytest
 
-from piccolo.cloud.soa import pack_points
+from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.views.zbuffer import nearest_depth, render_view, visible_points
 

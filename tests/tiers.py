@@ -9,9 +9,9 @@ from multiprocessing.process import BaseProcess
 
 import pytest
 
-from piccolo.kernels.ahead import HELPS
-from piccolo.paper.localize import PaperMap
+from piccolo.localization.paper import PaperMap
 from piccolo.scan_map.scan_map import ScanMap
+from piccolo.system.kernels.ahead import HELPS
 
 TIERS = ("pure", "scene", "process")  # each may use what those before it use
 

@@ -9,7 +9,7 @@ import rooms
 
 from piccolo.cli import localize
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
-from piccolo.jobs.threads import Workers
+from piccolo.system.jobs.threads import Workers
 from research.synthetic.walk_frames import writing_video
 from research.synthetic.world import free_position, photograph
 

@@ -8,18 +8,25 @@ from typing import Literal
 
 import numpy as np
 
-from ..arguments import check_fields, check_kind
-from ..arrays import Floats, Values
 from ..cloud.settings import METRES, CloudSettings, UpAxis
 from ..cloud.stream import ARRAYS, CloudStream, open_cloud, stream_of_arrays
-from ..errors import InputError
-from ..files.cache import sha256_of_files
-from ..jobs.threads import ProgressCallback, Stopwatch, Workers, no_progress, num_cores, report_progress
-from ..paper.localize import PaperMap, prepare as prepare_by_paper
-from ..photo import File
+from ..localization.paper import PaperMap, prepare as prepare_by_paper
+from ..photo.photo import File
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.open_map import CachePolicy, find_prepared_map, open_map
 from ..scan_map.scan_map import ScanMap, check_within, prepare_map
+from ..system.arguments import check_fields, check_kind
+from ..system.arrays import Floats, Values
+from ..system.errors import InputError
+from ..system.files.cache import sha256_of_files
+from ..system.jobs.threads import (
+    ProgressCallback,
+    Stopwatch,
+    Workers,
+    no_progress,
+    num_cores,
+    report_progress,
+)
 from .photo_reader import Settings
 from .scan import Scan
 

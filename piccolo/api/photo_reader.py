@@ -6,17 +6,17 @@ from typing import Any
 import numpy as np
 
 from ..cloud.settings import CloudSettings, from_wgs84
-from ..errors import InputError, is_passing, text_of
-from ..files.json_file import reading_once
-from ..jobs.memory import is_shortage
-from ..jobs.threads import Stopwatch
 from ..judge.result import FAILED, UNREADABLE, Result
 from ..judge.result_parts import FocalLength, Source
-from ..panorama import Panorama, check_labels, read_panorama
-from ..panorama.photo import PhotoFacts, read_photo_facts, sha256_of
-from ..paper.localize import PaperSettings
-from ..photo import GpsPrior, Photo, Prior
+from ..localization.paper import PaperSettings
+from ..photo.panorama import Panorama, check_labels, read_panorama
+from ..photo.panorama.facts import PhotoFacts, read_photo_facts, sha256_of
+from ..photo.photo import GpsPrior, Photo, Prior
 from ..problem.settings import CoarseToFineSettings
+from ..system.errors import InputError, is_passing, text_of
+from ..system.files.json_file import reading_once
+from ..system.jobs.memory import is_shortage
+from ..system.jobs.threads import Stopwatch
 
 LABELS_WARNING = "`labels`: the confidence was fitted to colours; with labels it is a rough estimate"
 Settings = CoarseToFineSettings | PaperSettings

@@ -5,9 +5,9 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..errors import UNPRINTABLE, InputError
-from ..files.json_file import parse_lines, read_bytes
 from ..judge.result import Result
+from ..system.errors import UNPRINTABLE, InputError
+from ..system.files.json_file import parse_lines, read_bytes
 
 NO_NAME = re.compile("[\ud800-\udc7f\udd00-\udfff]")  # what os.fsdecode never gives
 WANTED = "wanted JSON lines of localize.py"

@@ -7,24 +7,24 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any
 
-from ..arguments import check_kind, check_one_each
-from ..arrays import Bytes, Floats
 from ..cloud.settings import CloudSettings
-from ..cloud.soa import PackedPoints
-from ..errors import InputError
 from ..evidence.occlusion import occlusion_mask
-from ..files.atomic import check_output
+from ..geometry.points import PackedPoints
 from ..geometry.pose import Gravity, Pose, check_pose
-from ..jobs.threads import Workers
 from ..judge.result import Result
 from ..judge.result_parts import FocalLength
 from ..localization.means import NO_TRACE, Trace
-from ..paper.localize import PaperMap
-from ..photo import File, Photo, Prior, as_photo
+from ..localization.paper import PaperMap
+from ..photo.photo import File, Photo, Prior, as_photo
 from ..problem.accuracy import Accuracy
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.open_map import write_map
 from ..scan_map.scan_map import ScanMap, check_within
+from ..system.arguments import check_kind, check_one_each
+from ..system.arrays import Bytes, Floats
+from ..system.errors import InputError
+from ..system.files.atomic import check_output
+from ..system.jobs.threads import Workers
 from ..together.bundle_adjustment import RelativePoses
 from ..together.coloring.color_scan import Coloring
 from ..together.second_looks import Look, localize_in_order

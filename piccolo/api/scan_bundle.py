@@ -3,16 +3,16 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from ..errors import InputError
 from ..geometry.pose import Pose
-from ..jobs.threads import Stopwatch, Workers
 from ..judge.result import Result
 from ..localization.localize import has_guessed_focal
 from ..localization.means import NO_TRACE, Trace
 from ..localization.places import add_places
-from ..photo import Photo
+from ..photo.photo import Photo
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
+from ..system.errors import InputError
+from ..system.jobs.threads import Stopwatch, Workers
 from ..together.bundle import Posed, localize_bundle
 from ..together.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
 from ..together.members import check_photos

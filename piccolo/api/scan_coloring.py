@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from ..cloud.settings import CloudSettings
-from ..errors import InputError
-from ..files.atomic import check_output
-from ..files.line_file import Journal
-from ..jobs.threads import Workers
 from ..judge.result import Result
 from ..scan_map.scan_map import ScanMap
+from ..system.errors import InputError
+from ..system.files.atomic import check_output
+from ..system.files.line_file import Journal
+from ..system.jobs.threads import Workers
 from ..together.coloring.color_scan import (
     OF_RESULTS,
     Coloring,

@@ -4,16 +4,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from ..jobs.threads import Stopwatch, Workers
 from ..judge.result import Result
 from ..judge.result_parts import Beside
 from ..localization.means import NO_TRACE, Trace
 from ..localization.places import add_places
-from ..panorama import Panorama
-from ..panorama.photo import PhotoFacts
-from ..photo import Photo
+from ..photo.panorama import Panorama
+from ..photo.panorama.facts import PhotoFacts
+from ..photo.photo import Photo
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
+from ..system.jobs.threads import Stopwatch, Workers
 from ..together.group import localize_group
 from ..together.members import Shot, check_photos
 from ..together.second_looks import digest_of

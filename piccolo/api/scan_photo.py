@@ -3,17 +3,17 @@
 from dataclasses import replace
 from typing import NamedTuple
 
-from ..jobs.threads import Stopwatch, Workers
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result, nothing_found
 from ..judge.result_parts import FocalLength
 from ..localization.localize import has_guessed_focal, localize, localize_guessed
 from ..localization.means import NO_TRACE, Means, Trace
+from ..localization.paper import PaperMap, PaperSettings, localize as localize_by_paper
 from ..localization.places import add_places
-from ..paper.localize import PaperMap, PaperSettings, localize as localize_by_paper
-from ..photo import Photo
+from ..photo.photo import Photo
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
+from ..system.jobs.threads import Stopwatch, Workers
 from .photo_reader import PhotoReader, Settings
 
 

@@ -7,19 +7,19 @@ from typing import NamedTuple
 import numpy as np
 
 from .. import __version__
-from ..arguments import check_kind
-from ..arrays import Bytes
-from ..errors import InputError
-from ..files.json_file import reading_once
 from ..geometry.pose import Pose, check_pose
-from ..jobs.threads import Progress, Stopwatch, no_progress
 from ..judge.result import Result
 from ..judge.result_parts import WalkFrame
 from ..localization.places import add_places
-from ..panorama import Panorama
-from ..panorama.photo import read_photo_facts, sha256_of
-from ..photo import File, Photo, as_photo
+from ..photo.panorama import Panorama
+from ..photo.panorama.facts import read_photo_facts, sha256_of
+from ..photo.photo import File, Photo, as_photo
 from ..problem.problem import Problem
+from ..system.arguments import check_kind
+from ..system.arrays import Bytes
+from ..system.errors import InputError
+from ..system.files.json_file import reading_once
+from ..system.jobs.threads import Progress, Stopwatch, no_progress
 from ..together.walk.frames import Frame, check_times
 from ..together.walk.path import believe
 from ..together.walk.results import describe_frame, make_localization, make_localizations

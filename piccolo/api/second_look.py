@@ -5,19 +5,19 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Protocol
 
-from ..errors import InputError, is_passing
 from ..geometry.nearness import CONFIRMED
-from ..jobs.threads import Stopwatch, Workers
 from ..judge.result import Result
 from ..judge.result_parts import Beside, FocalLength
 from ..localization.localize import has_guessed_focal
 from ..localization.places import add_places
-from ..panorama import Panorama
-from ..panorama.photo import PhotoFacts
-from ..photo import Photo
+from ..photo.panorama import Panorama
+from ..photo.panorama.facts import PhotoFacts
+from ..photo.photo import Photo
 from ..problem.problem import prepare_problem
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
+from ..system.errors import InputError, is_passing
+from ..system.jobs.threads import Stopwatch, Workers
 from ..together.among import Known, localize_among
 from ..together.beside import SurePhoto, localize_beside, place_sure
 from ..together.second_looks import MOST_PICTURES, Look, follow, is_doubtful, names_of

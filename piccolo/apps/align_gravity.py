@@ -6,22 +6,22 @@ from pathlib import Path
 import numpy as np
 
 from ..api.scan import Scan
-from ..arrays import Array
 from ..cli.command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from ..cli.options import add_cloud_options
 from ..cli.settings import cloud_settings_from
+from ..cloud.gravity import MAX_LEAN, dot, find_up, level, wall_yaw
 from ..cloud.octree import build_octree
 from ..cloud.settings import CloudSettings, R_z_from_axis
 from ..cloud.stream import CloudStream, open_cloud
 from ..cloud.writers import describe_unit, write_transformed
-from ..files.atomic import is_stream, write_atomically
 from ..geometry.pose import orthonormal, rotation_to_z, yaw_rotation
-from ..gravity.alignment import MAX_LEAN, dot, find_up, level, wall_yaw
-from ..jobs.threads import Workers, num_cores
 from ..judge.probability import LOCALIZED
-from ..panorama import read_panorama
+from ..photo.panorama import read_panorama
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import prepare_map
+from ..system.arrays import Array
+from ..system.files.atomic import is_stream, write_atomically
+from ..system.jobs.threads import Workers, num_cores
 
 EXIT_UNKNOWN = 1
 EPILOG = """\

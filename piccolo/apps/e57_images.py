@@ -4,14 +4,13 @@ import json
 from argparse import ArgumentParser
 from pathlib import Path
 
-from ..camera import Camera, Mount
-from ..camera.calibration import document_of
 from ..cli.command import Arguments, check_distinct, check_folder_name, command, option
 from ..cloud.readers.e57 import E57Image, list_images, read_image
-from ..errors import InputError
-from ..files.atomic import write_atomically
 from ..geometry.pose import quaternion_wxyz
-from .export.reconstructions import write_json
+from ..photo.camera import Camera, Mount
+from ..photo.camera.calibration import document_of
+from ..system.errors import InputError
+from ..system.files.atomic import write_atomically, write_json
 
 EPILOG = """\
 example:

@@ -9,19 +9,25 @@ from typing import NamedTuple
 import numpy as np
 
 from ..api.result_files import read_results
-from ..arrays import Array32
-from ..camera import Camera, Mount
-from ..camera.calibration import read_calibration
 from ..cli.command import Arguments, check_distinct, check_suffix, checking_options, command, option
 from ..cli.options import add_cloud_options
 from ..cli.settings import cloud_settings_from
-from ..cloud.soa import LocalCloud
-from ..errors import InputError
-from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
-from ..files.json_file import read_text
+from ..geometry.points import LocalCloud
 from ..geometry.pose import CAMERA_AXES, Pose, R_cam_from_angles, check_pose, check_transform
-from ..jobs.threads import Workers
+from ..photo.camera import Camera, Mount
+from ..photo.camera.calibration import read_calibration
 from ..scan_map.open_map import open_points
+from ..system.arrays import Array32
+from ..system.errors import InputError
+from ..system.files.atomic import (
+    check_output,
+    check_output_folder,
+    is_stream,
+    replacing_folder,
+    write_atomically,
+)
+from ..system.files.json_file import read_text
+from ..system.jobs.threads import Workers
 from ..views.pictures import cut_view, encode_image, fill_holes, sphere_width_for
 from ..views.surfels import render_points
 

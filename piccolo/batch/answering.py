@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..jobs.cluster import Cluster
-from ..jobs.interruption import Interruption
-from ..jobs.processes import Here, Processes, WorkerLostError
 from ..judge.result import Result
+from ..system.jobs.cluster import Cluster
+from ..system.jobs.interruption import Interruption
+from ..system.jobs.processes import Here, Processes, WorkerLostError
 from ..together.second_looks import Change, Look, revise
 from .localizer import Answer, Localizer, Task
 

@@ -13,13 +13,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, TextIO
 
-from ..arguments import EXIF, NAMES, ORDER, PICTURES
-from ..errors import InputError, printable
-from ..files.json_file import read_bytes, read_text
-from ..panorama.cube import is_cube
-from ..panorama.photo import read_photo_facts
-from ..photo import Photo, Prior, Vector
+from ..photo.panorama.cube import is_cube
+from ..photo.panorama.facts import read_photo_facts
+from ..photo.photo import Photo, Prior, Vector
 from ..scan_map.scan_map import ScanMap, check_within
+from ..system.arguments import EXIF, NAMES, ORDER, PICTURES
+from ..system.errors import InputError, printable
+from ..system.files.json_file import read_bytes, read_text
 from ..together.walk.frames import check_times
 
 STDIN = "-"

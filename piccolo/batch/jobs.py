@@ -16,19 +16,19 @@ from ..api.scan import Scan
 from ..api.scan_bundle import AskedPosed, localize_posed
 from ..api.scan_group import OF_RESULTS, AskedTogether, localize_photos_together
 from ..api.scan_walk import Walk
-from ..errors import InputError
-from ..files.atomic import STDOUT, is_stream, write_lines
-from ..files.line_file import Journal, keeping_steps
 from ..geometry.pose import Pose
-from ..jobs.interruption import Interruption, interruptible
-from ..jobs.processes import InFlight, Pair
-from ..jobs.threads import Progress, Stopwatch
 from ..judge.result import FAILED, UNREADABLE, Result
 from ..localization.means import Step, Trace
-from ..panorama.photo import sha256_of
-from ..photo import Photo
+from ..photo.panorama.facts import sha256_of
+from ..photo.photo import Photo
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
+from ..system.errors import InputError
+from ..system.files.atomic import STDOUT, is_stream, write_lines
+from ..system.files.line_file import Journal, keeping_steps
+from ..system.jobs.interruption import Interruption, interruptible
+from ..system.jobs.processes import InFlight, Pair
+from ..system.jobs.threads import Progress, Stopwatch
 from ..together.coloring import color_scan
 from .localizer import Localizer, rename
 from .relative_poses import find_scale, read_relative_poses

@@ -15,21 +15,21 @@ from ..api.scan import Scan
 from ..api.scan_group import AskedTogether, localize_photos_together
 from ..api.scan_photo import Asked
 from ..api.second_look import Others
-from ..camera import Calibration
 from ..cloud.settings import CloudSettings
-from ..files.atomic import temporary_folder, write_temporary
-from ..files.json_file import reading_once
-from ..jobs.cluster import find_sent_file
-from ..jobs.memory import limit_memory
-from ..jobs.processes import WorkerLostError
-from ..jobs.threads import Workers
 from ..judge.result import Result
 from ..judge.result_parts import Source
 from ..localization.means import Step, Trace
-from ..photo import Photo, Vector
+from ..photo.camera import Calibration
+from ..photo.photo import Photo, Vector
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
+from ..system.files.atomic import temporary_folder, write_temporary
+from ..system.files.json_file import reading_once
+from ..system.jobs.cluster import find_sent_file
+from ..system.jobs.memory import limit_memory
+from ..system.jobs.processes import WorkerLostError
+from ..system.jobs.threads import Workers
 from ..together.second_looks import Look, localize_in_order
 from ..views.pictures import encode_image, overlay_png
 from .inputs import PriorTable

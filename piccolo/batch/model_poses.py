@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import Array
-from ..camera.foreign import is_reconstruction
-from ..files.json_file import naming, read_json
 from ..geometry.pose import OPENGL_FROM_CAM, OPTICAL_FROM_CAM, Pose, check_transform, exp_so3
+from ..photo.camera.foreign import is_reconstruction
+from ..system.arrays import Array
+from ..system.files.json_file import naming, read_json
 from ..together.bundle_adjustment import RelativeScale
 
 SUFFIXES = (".json", ".sfm")

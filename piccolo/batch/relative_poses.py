@@ -9,14 +9,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ..arguments import PICTURES
-from ..arrays import Array
-from ..camera.foreign import NUM_COLMAP, parse_xml, read_images
-from ..cloud.readers.text_columns import is_number
-from ..errors import InputError
-from ..files.json_file import naming, read_text
-from ..files.photo_names import match_names
 from ..geometry.pose import OPTICAL_FROM_CAM, Pose, check_transform, rotation_from_quaternion_wxyz
+from ..photo.camera.foreign import NUM_COLMAP, parse_xml, read_images
+from ..system.arguments import PICTURES
+from ..system.arrays import Array
+from ..system.errors import InputError
+from ..system.files.json_file import is_number, naming, read_text
+from ..system.files.photo_names import match_names
 from ..together.bundle_adjustment import RelativeScale
 from .model_poses import SUFFIXES, NamedPose, read_json_poses
 

@@ -18,11 +18,11 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ..arguments import PICTURES
-from ..errors import InputError, printable, text_of
-from ..files.atomic import check_output, is_stdout, is_stream
-from ..jobs.memory import check_address_space, is_shortage
-from ..jobs.threads import Progress, Workers, num_cores
+from ..system.arguments import PICTURES
+from ..system.errors import InputError, printable, text_of
+from ..system.files.atomic import check_output, is_stdout, is_stream
+from ..system.jobs.memory import check_address_space, is_shortage
+from ..system.jobs.threads import Progress, Workers, num_cores
 from .start import EXIT_INTERRUPTED, EXIT_TERMINATED, for_terminal, load, name_of, quit_at_once
 from .terminal import LOG, progress_bar, showing_log
 
@@ -85,7 +85,7 @@ class Arguments(argparse.Namespace):
 
         If this process has to compile kernels, others help.
         """
-        from ..kernels import ahead  # noqa: PLC0415  # Numba is imported where it is used
+        from ..system.kernels import ahead  # noqa: PLC0415  # Numba is imported where it is used
 
         ahead.get_help()
         return Workers(num_threads or num_cores(), self.progress(), LOG.warning)

@@ -12,19 +12,19 @@ from tqdm import tqdm
 from ..api.scan import Scan
 from ..batch.answering import Executor
 from ..batch.localizer import Localizer
-from ..errors import InputError, printable
 from ..evidence.focal_length import WIDE
-from ..jobs.cluster import Cluster, connect
-from ..jobs.interruption import SIGNALS, Interruption
-from ..jobs.memory import GB, memory_left, memory_taken
-from ..jobs.processes import Here, Processes
-from ..jobs.threads import num_cores
 from ..judge.probability import AMBIGUOUS, LOCALIZED
 from ..judge.result import FAILED, UNREADABLE, Result
 from ..judge.sure import WORTH_A_LOOK
 from ..scan_map.map_file import save_map
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.scan_map import ScanMap
+from ..system.errors import InputError, printable
+from ..system.jobs.cluster import Cluster, connect
+from ..system.jobs.interruption import SIGNALS, Interruption
+from ..system.jobs.memory import GB, memory_left, memory_taken
+from ..system.jobs.processes import Here, Processes
+from ..system.jobs.threads import num_cores
 from .command import EXIT_BAD_INPUT, Arguments, UsageError
 from .options import PHOTOS_OF_A_JOB
 from .start import for_terminal

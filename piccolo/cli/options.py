@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import get_args
 
 from .. import __version__
-from ..arguments import EXIF, MAX_SPEED, MAX_STEP, MIN_CONFIDENCE, NAMES, ORDER, Projection
 from ..cloud.settings import METRES, RANGES, UpAxis
-from ..errors import InputError
+from ..system.arguments import EXIF, MAX_SPEED, MAX_STEP, MIN_CONFIDENCE, NAMES, ORDER, Projection
+from ..system.errors import InputError
 from .command import Arguments, option
 
 DESCRIPTION = "Find the camera poses of photos, 360-degree panoramas or others, in a coloured point cloud."

@@ -15,28 +15,35 @@ from typing import Any
 import numpy as np
 
 from ..api.scan import Scan
-from ..arguments import PICTURES
 from ..batch.answering import Answering
 from ..batch.inputs import describe_left_out, is_from_stdin, list_panoramas, read_priors
 from ..batch.localizer import Answer, Localizer
 from ..batch.results_file import FileOutput, Output, Records, StreamOutput
-from ..errors import InputError
-from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, temporary_folder, write_atomically
-from ..files.line_file import open_locked, write_line
-from ..jobs.interruption import Interruption, interruptible
-from ..jobs.memory import limit_memory
-from ..jobs.threads import Stopwatch, num_cores
 from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..judge.result import FAILED, UNREADABLE, Result
 from ..localization.means import Step
-from ..panorama import read_panorama
-from ..panorama.cube import is_cube
-from ..panorama.masks import find_mask
-from ..panorama.photo import sha256_of
-from ..photo import Photo
+from ..photo.panorama import read_panorama
+from ..photo.panorama.cube import is_cube
+from ..photo.panorama.facts import sha256_of
+from ..photo.panorama.masks import find_mask
+from ..photo.photo import Photo
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
+from ..system.arguments import PICTURES
+from ..system.errors import InputError
+from ..system.files.atomic import (
+    STDOUT,
+    check_output,
+    is_stdout,
+    is_stream,
+    temporary_folder,
+    write_atomically,
+)
+from ..system.files.line_file import open_locked, write_line
+from ..system.jobs.interruption import Interruption, interruptible
+from ..system.jobs.memory import limit_memory
+from ..system.jobs.threads import Stopwatch, num_cores
 from ..together.second_looks import LISTINGS, Change, follow_cameras
 from ..views.pictures import encode_image
 from . import execution, terminal, together

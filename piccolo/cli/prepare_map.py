@@ -2,9 +2,9 @@
 
 from argparse import ArgumentParser
 
-from ..jobs.threads import Stopwatch
 from ..scan_map.open_map import CachePolicy, extend_map, open_map, write_map
 from ..scan_map.scan_map import check_name, name_scan
+from ..system.jobs.threads import Stopwatch
 from .command import Arguments, check_outputs, checking_options, command, option
 from .options import add_cloud_options
 from .settings import cloud_settings_from

@@ -9,13 +9,13 @@ from ..api.photo_reader import Settings
 from ..api.scan import ONLY_DEFAULT
 from ..batch.localizer import Localizer
 from ..cloud.settings import CloudSettings
-from ..errors import InputError
-from ..panorama import check_labels
-from ..paper.localize import PaperSettings
-from ..photo import NOTHING_KNOWN, Photo, Prior
+from ..localization.paper import PaperSettings
+from ..photo.panorama import check_labels
+from ..photo.photo import NOTHING_KNOWN, Photo, Prior
 from ..problem.accuracy import Accuracy
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.open_map import CachePolicy
+from ..system.errors import InputError
 from .command import Arguments
 from .options import NONE
 

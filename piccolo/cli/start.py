@@ -8,7 +8,7 @@ from importlib import import_module
 from types import FrameType
 from typing import Any
 
-from ..jobs.memory import limit_of_process, share_arenas
+from ..system.jobs.memory import limit_of_process, share_arenas
 
 # a command in a text, by the script of the checkout
 SCRIPT = re.compile(r"(?:python )?(?:\b(localize)|tools/(\w+))\.py\b")

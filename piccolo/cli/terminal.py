@@ -8,8 +8,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ..errors import printable
-from ..jobs.threads import Progress
+from ..system.errors import printable
+from ..system.jobs.threads import Progress
 from .start import for_terminal
 
 DELAY = 0.5  # seconds: what takes less needs no bar

@@ -25,13 +25,13 @@ from ..batch.jobs import (
 )
 from ..batch.localizer import Localizer
 from ..batch.relative_poses import read_odometry
-from ..files.atomic import temporary_folder
-from ..jobs.interruption import Interruption
-from ..jobs.processes import Pair
 from ..judge.result import Result
-from ..panorama.photo import sha256_of
-from ..panorama.video import choose_distinct, frames_of_chapters
-from ..photo import Photo
+from ..photo.panorama.facts import sha256_of
+from ..photo.panorama.video import choose_distinct, frames_of_chapters
+from ..photo.photo import Photo
+from ..system.files.atomic import temporary_folder
+from ..system.jobs.interruption import Interruption
+from ..system.jobs.processes import Pair
 from ..together.coloring import color_scan
 from ..together.series import MOST_IN_SERIES
 from ..together.walk.frames import Motion

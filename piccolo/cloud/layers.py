@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Int8s, Int64s
 from ..geometry.robust import weigh_absolute
-from ..jobs.threads import Workers, one_blas_thread
+from ..system.arrays import Array, Int8s, Int64s
+from ..system.jobs.threads import Workers, one_blas_thread
 from .octree import Octree
 from .profiles import BIN, NUM_PROFILE_BINS, Profiles, measure_profiles
 

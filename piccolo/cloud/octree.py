@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Array32, Int32s
 from ..geometry.cone import Cone, is_apart
 from ..geometry.vectors import Triple
-from ..jobs.memory import check_memory
-from ..kernels.jit import F0, Scalar, inline_kernel, kernel
+from ..system.arrays import Array, Array32, Int32s
+from ..system.jobs.memory import check_memory
+from ..system.kernels.jit import F0, Scalar, inline_kernel, kernel
 from .voxels import LEAF_SIZE, NUM_LEVELS, THIN, VOXELS_AT_ONCE, Voxels
 
 NODE_BYTES = 6 * 4 + 4  # mean, first child

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..arrays import Array, Bytes, Mask
-from ..errors import InputError
 from ..geometry.pose import MAX_COORDINATE
+from ..system.arrays import Array, Bytes, Mask
+from ..system.errors import InputError
 from .readers import reader
 
 MIN_POINTS = 1000

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Int32s, Int64s
 from ..geometry.vectors import Triple, cross, dot
-from ..jobs.threads import Workers
-from ..kernels.jit import Scalar, inline_kernel, kernel
+from ..system.arrays import Array, Int32s, Int64s
+from ..system.jobs.threads import Workers
+from ..system.kernels.jit import Scalar, inline_kernel, kernel
 from .octree import DIAGONAL, Octree
 
 BIN = 0.005  # [m] of heights

@@ -7,10 +7,10 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ..arrays import Array
-from ..errors import InputError, import_optional
 from ..geometry.colors import Labels
 from ..geometry.pose import rotation_to_z
+from ..system.arrays import Array
+from ..system.errors import InputError, import_optional
 
 # of points: what photos are compared with
 Channel = Literal["colors", "intensity", "shape"]

@@ -13,12 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Array32, Bytes, Floats, Values
-from ..errors import InputError
-from ..files.cache import sha256_of_arrays
 from ..geometry.pose import rotate_points
-from ..jobs.memory import check_address_space
-from ..jobs.threads import Progress, Workers, no_progress
+from ..system.arrays import Array, Array32, Bytes, Floats, Values
+from ..system.errors import InputError
+from ..system.files.cache import sha256_of_arrays
+from ..system.jobs.memory import check_address_space
+from ..system.jobs.threads import Progress, Workers, no_progress
 from .point_validator import Chunk, PointValidator, find_box
 from .readers import e57, e57_file, las, las_file, mesh, mesh_files, npz, pcd, ply, reader, text
 from .settings import BY_FILE, Channel, CloudSettings, UpAxis

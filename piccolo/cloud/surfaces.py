@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Array32, Int64s, Integers
 from ..geometry.colors import colors_of_edges
 from ..geometry.robust import weigh_absolute
-from ..jobs.threads import Workers
+from ..system.arrays import Array, Array32, Int64s, Integers
+from ..system.jobs.threads import Workers
 from .octree import Octree, recolor
 
 CELLS_AT_ONCE = 20_000  # voxels of a task

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from ..errors import InputError, import_optional
+from ..system.errors import InputError, import_optional
 from .settings import METRES
 
 TOKEN = re.compile(r'"(?:[^"]|"")*"|[\w.+-]+|[\[\](),]')

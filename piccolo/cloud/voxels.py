@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Array32, Bytes, Int32s, Int64s
-from ..errors import InputError
-from ..jobs.memory import check_memory
-from ..kernels.jit import inline_kernel, kernel
+from ..system.arrays import Array, Array32, Bytes, Int32s, Int64s
+from ..system.errors import InputError
+from ..system.jobs.memory import check_memory
+from ..system.kernels.jit import inline_kernel, kernel
 
 NUM_CELLS = 1 << 21  # along an axis; three axes fill 63 bits
 LEAF_SIZE = 0.02  # [m]

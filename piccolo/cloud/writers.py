@@ -10,11 +10,11 @@ from typing import IO, Any
 
 import numpy as np
 
-from ..arrays import Array, Bytes, Floats, Values
-from ..errors import import_optional
-from ..files.atomic import replacing, replacing_by_library
 from ..geometry.pose import transform_points
-from ..jobs.memory import check_memory
+from ..system.arrays import Array, Bytes, Floats, Values
+from ..system.errors import import_optional
+from ..system.files.atomic import replacing, replacing_by_library
+from ..system.jobs.memory import check_memory
 from .readers.ply import MAGIC, PlyHeader, place_of_vertices, read_columns, read_header
 from .readers.reader import POINTS_A_CHUNK
 from .settings import METRES

@@ -9,16 +9,16 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..arrays import Array, Array32, Int32s
 from ..geometry.pose import Pose
 from ..geometry.sphere import BLOCK_RINGS, find_cell, make_grid, pixel_rays
 from ..judge.candidate import CONTRADICTS, Comparison, Unoccluded
-from ..kernels.jit import F0, copy_to, kernel
 from ..optimize.channel_loss import NUM_BLOCKS
-from ..panorama.local_normalization import opponent, zscore
-from ..panorama.texels import TEXEL_CHUNK, Texels, make_chunk, project, sample
+from ..photo.panorama.local_normalization import opponent, zscore
+from ..photo.panorama.texels import TEXEL_CHUNK, Texels, make_chunk, project, sample
 from ..problem.problem import Problem
 from ..problem.profile import VIEWS
+from ..system.arrays import Array, Array32, Int32s
+from ..system.kernels.jit import F0, copy_to, kernel
 from ..views.points_around import round_position
 from ..views.view import ViewArrays, ViewConfig, average_colors, cell_statistics, empty_cells, locate
 

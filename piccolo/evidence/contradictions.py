@@ -4,7 +4,7 @@ import math
 
 from ..geometry.pose import MAX_ANGLE, MAX_DISTANCE, Pose
 from ..judge.reasons import Contradiction, Reason
-from ..photo import Prior
+from ..photo.photo import Prior
 from ..problem.prior import heading_errors
 from ..scan_map.camera_positions import heights_above_floor
 from ..scan_map.scan_map import ScanMap, find_scan_at

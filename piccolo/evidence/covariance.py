@@ -6,23 +6,23 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, Int64s, Mask
+from ..geometry.levenberg_marquardt import GRADIENT, MATRIX, NUM_SUMS
 from ..geometry.nearness import ROOM_RANGE
 from ..geometry.pose import Pose, rotate_points, step, step_between, yaw_rotation
 from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
 from ..geometry.sphere import compute_indices, find_cell, make_grid
-from ..jobs.threads import Workers
 from ..judge.candidate import Candidate
 from ..judge.case import UNKNOWN_ERRORS, Errors
-from ..kernels.jit import kernel
 from ..optimize.channel_loss import ChannelProblem, channel_equations, descend_channels, equations_by_part
-from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
-from ..panorama.local_normalization import LEVELS_PER_UNIT, to_levels
-from ..panorama.texels import Texels
+from ..photo.panorama.local_normalization import LEVELS_PER_UNIT, to_levels
+from ..photo.panorama.texels import Texels
 from ..problem.photo_images import PhotoImages
 from ..problem.problem import Problem
 from ..problem.profile import Profile
 from ..problem.stages import LAST
+from ..system.arrays import Array, Int64s, Mask
+from ..system.jobs.threads import Workers
+from ..system.kernels.jit import kernel
 from ..views.view import Cells
 from .comparison import mask_occluders
 from .contradictions import contradictions

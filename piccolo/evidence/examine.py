@@ -6,12 +6,12 @@ from functools import partial
 
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
-from ..jobs.threads import Workers
 from ..judge.candidate import NO_CANDIDATE, Candidate, Selection
 from ..judge.selection import list_drawn, select
 from ..local_features.hypotheses import count_matches
 from ..problem.problem import Problem
 from ..problem.profile import DRAWN_VIEW
+from ..system.jobs.threads import Workers
 from .comparison import compare
 from .contradictions import contradictions
 from .verification import draw_near, verify

@@ -14,25 +14,25 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ..arrays import Array, Mask
-from ..camera import Camera
-from ..camera.corrections import FOCAL, LENS, Corrections
-from ..camera.model import MODELS, RADIAL
 from ..geometry.pose import Pose, rotate_points
 from ..geometry.pose_gaussian import PoseGaussian, add
 from ..geometry.sphere import compute_indices
-from ..jobs.threads import Workers
 from ..judge.belief import UNCONFIRMED
 from ..judge.candidate import Candidate
 from ..judge.claim import Claim, marginal
 from ..judge.consensus import WRONG_DEVIATION, WRONG_SHARE, Opinion
 from ..judge.result_parts import FocalLength
 from ..local_features.matching import NO_MATCHES, Matches
-from ..panorama import Panorama
-from ..panorama.model import FocalPrior
+from ..photo.camera import Camera
+from ..photo.camera.corrections import FOCAL, LENS, Corrections
+from ..photo.camera.model import MODELS, RADIAL
+from ..photo.panorama import Panorama
+from ..photo.panorama.model import FocalPrior
 from ..problem.accuracy import Accuracy
 from ..problem.problem import Problem
 from ..problem.stages import Limits
+from ..system.arrays import Array, Mask
+from ..system.jobs.threads import Workers
 from ..views.view import Cells
 from .comparison import mask_occluders
 from .covariance import UNCALIBRATED, compute_acting_range

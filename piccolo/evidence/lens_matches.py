@@ -5,16 +5,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array
-from ..camera import Mount
-from ..camera.corrections import FOCAL, LENS, Corrections
+from ..geometry.gauss_newton import sum_observations
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LOOSE, add, differentiate_rays
 from ..geometry.robust import geman_mcclure
 from ..local_features.matching import Matches
-from ..optimize.gauss_newton import sum_observations
 from ..optimize.self_calibration import NUM_OF_POSE
+from ..photo.camera import Mount
+from ..photo.camera.corrections import FOCAL, LENS, Corrections
 from ..problem.method import Method
+from ..system.arrays import Array
 from .self_calibration import Estimate, invert
 from .verification import LEAST_ERROR
 

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from ..jobs.threads import Workers
 from ..judge.candidate import Selection
 from ..judge.case import Geometry, Measured
 from ..judge.result_parts import Evidence
 from ..judge.selection import count_matches
 from ..optimize.sampling_loss import sampling_loss
 from ..problem.problem import Problem
+from ..system.jobs.threads import Workers
 from ..views.zbuffer import visible_points
 from .contradictions import contradictions
 from .covariance import estimate_errors

@@ -13,15 +13,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array32, Bytes, Mask
-from ..cloud.soa import PackedPoints
+from ..geometry.points import PackedPoints
 from ..geometry.pose import Pose
 from ..geometry.robust import geman_mcclure
 from ..geometry.sphere import solid_angles
-from ..kernels.jit import F0, F1, kernel
-from ..panorama import Panorama, local_normalization
-from ..panorama.local_normalization import normalize_locally, opponent_channels
-from ..panorama.model import resize, shrink
+from ..photo.panorama import Panorama, local_normalization
+from ..photo.panorama.local_normalization import normalize_locally, opponent_channels
+from ..photo.panorama.model import resize, shrink
+from ..system.arrays import Array32, Bytes, Mask
+from ..system.kernels.jit import F0, F1, kernel
 from ..views.zbuffer import View, render_view
 
 OCCLUSION_WIDTHS = (

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from ..arrays import Array
 from ..cloud.layers import gap_variance
 from ..geometry.pose import Pose
 from ..scan_map.scan_map import ScanMap
+from ..system.arrays import Array
 
 SHAPE_TURN = 0.003  # [rad] by which edges of a photo are not where the scan's are, in all blocks alike
 SHAPE_MOVE = 0.01  # [m]

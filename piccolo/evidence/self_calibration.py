@@ -9,16 +9,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Array32, Int64s
-from ..camera.corrections import Corrections
+from ..geometry.gauss_newton import Equations, minimize
 from ..geometry.pose import Pose, step
 from ..judge.claim import Told
 from ..optimize.channel_loss import ChannelProblem
-from ..optimize.gauss_newton import Equations, minimize
 from ..optimize.self_calibration import NUM_OF_POSE, FreeSums, sum_free_equations
-from ..panorama.local_normalization import LEVELS_PER_UNIT, to_levels
-from ..panorama.texels import Texels
+from ..photo.camera.corrections import Corrections
+from ..photo.panorama.local_normalization import LEVELS_PER_UNIT, to_levels
+from ..photo.panorama.texels import Texels
 from ..problem.stages import Limits
+from ..system.arrays import Array, Array32, Int64s
 from ..views.view import Cells
 from .covariance import jackknife_gradients, sort_by_block, take
 

@@ -12,15 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array
-from ..camera import Camera, Mount
-from ..camera.corrections import Corrections
 from ..geometry.pose import Pose
-from ..jobs.threads import Workers
 from ..judge.claim import Claim
 from ..judge.result_parts import SphereGeometry
+from ..photo.camera import Camera, Mount
+from ..photo.camera.corrections import Corrections
 from ..problem.problem import Problem
 from ..problem.stages import Limits
+from ..system.arrays import Array
+from ..system.jobs.threads import Workers
 from .self_calibration import Estimate, Freedom, FreeEnd, descend_freely, invert
 
 NO_CORRECTION = np.zeros(3)

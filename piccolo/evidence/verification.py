@@ -12,12 +12,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ..arrays import Array, Array32, Bytes
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
 from ..geometry.pose_gaussian import LOOSE, differentiate_rays
 from ..geometry.sphere import compute_indices
-from ..jobs.threads import Workers
 from ..judge.candidate import Drawn
 from ..local_features.hypotheses import COS_EXACT, LEAST_MATCHES, count_matches, exact_pose, find_inliers
 from ..local_features.keypoints import Keypoints, find_in_view, join_keypoints
@@ -34,6 +32,8 @@ from ..local_features.perspective_view import PerspectiveView, add_margin
 from ..local_features.view_image import ViewImage, render_gray
 from ..problem.method import Method
 from ..problem.problem import Problem
+from ..system.arrays import Array, Array32, Bytes
+from ..system.jobs.threads import Workers
 from .occlusion import EXPLAINED, occlusion_mask
 
 PLACE = 0.1  # [m] the scan is drawn at positions on a grid of this spacing

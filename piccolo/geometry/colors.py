@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ..arrays import Array, Bytes, Floats, Int32s, Integers, Mask
+from ..system.arrays import Array, Bytes, Floats, Int32s, Integers, Mask
 
 NUM_LEVELS = 16  # of a channel that colours are made of
 NUM_COLORS = 4093  # a prime: labels that count in steps of 256 or 65,536 do not fall together

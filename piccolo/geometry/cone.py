@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Floats
-from ..kernels.jit import F0, Scalar, inline_kernel
+from ..system.arrays import Array, Floats
+from ..system.kernels.jit import F0, Scalar, inline_kernel
 
 
 class Cone(NamedTuple):

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Int64s
-from ..kernels.jit import copy_to, kernel
+from ..system.arrays import Array, Int64s
+from ..system.kernels.jit import copy_to, kernel
 from .pose import MAX_ANGLE, MAX_DISTANCE, Pose, pose_errors
 from .vectors import dot, minus, row
 

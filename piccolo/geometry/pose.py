@@ -10,8 +10,8 @@ from typing import Literal
 
 import numpy as np
 
-from ..arrays import Array
-from ..errors import InputError
+from ..system.arrays import Array
+from ..system.errors import InputError
 
 NEWTON_STEPS = 4  # from an error of 5 % to rounding
 MAX_DISTANCE = 0.1  # [m] the paper's line between correct and wrong

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Array, Floats
+from ..system.arrays import Array, Floats
 from .nearness import Nearness
 from .pose import Pose, exp_so3, log_so3, orthonormal, rotate_points, skew
 

@@ -9,8 +9,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..arrays import Array, Array32
-from ..kernels.jit import F1, HALF, Scalar, inline_kernel
+from ..system.arrays import Array, Array32
+from ..system.kernels.jit import F1, HALF, Scalar, inline_kernel
 
 Number = TypeVar("Number", Scalar, Array, Array32)
 

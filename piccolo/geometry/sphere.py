@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Array, Array32, Floats, Int32s, Int64s
-from ..kernels.jit import F0, HALF, Scalar, inline_kernel
+from ..system.arrays import Array, Array32, Floats, Int32s, Int64s
+from ..system.kernels.jit import F0, HALF, Scalar, inline_kernel
 
 PI = np.float32(math.pi)
 HALF_PI = np.float32(math.pi / 2)

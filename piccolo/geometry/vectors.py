@@ -1,7 +1,7 @@
 """Vectors of three numbers in kernels: tuples, or arrays (3,) that are read."""
 
-from ..arrays import Floats
-from ..kernels.jit import Scalar, inline_kernel
+from ..system.arrays import Floats
+from ..system.kernels.jit import Scalar, inline_kernel
 
 Triple = tuple[Scalar, Scalar, Scalar]
 Vector = Triple | Floats

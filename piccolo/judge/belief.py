@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array
+from ..system.arrays import Array
 from .probability import NOT_LOCALIZED, classify
 from .reasons import Reason
 

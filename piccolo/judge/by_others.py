@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array
+from ..system.arrays import Array
 from .belief import Belief, make_belief
 
 LEAST_NONE = 1e-6

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Mask
 from ..geometry.pose import Pose
 from ..local_features.matching import Matches
 from ..optimize.channel_loss import CHANCE_CORRELATION, NUM_BLOCKS
 from ..problem.photo_images import PhotoImages
+from ..system.arrays import Array, Mask
 from .reasons import Contradiction
 
 CONTRADICTS = 0.1  # a block with a lower correlation is left out of the local means and deviations

@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-from ..arrays import Array
-from ..camera import Mount
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
+from ..photo.camera import Mount
+from ..system.arrays import Array
 from .candidate import Selection
 from .probability import Standing
 from .reasons import Contradiction

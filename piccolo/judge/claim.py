@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri, stdtr
 
-from ..arrays import Array
+from ..system.arrays import Array
 from .consensus import MOST_LOG
 
 LEAST_CHANCE = 1e-300  # that a distribution is asked for

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Array
 from ..geometry.pose import ByValue
 from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
+from ..system.arrays import Array
 
 SAME_STD_RATIO = 1.5  # deviations that differ by less have no such direction
 

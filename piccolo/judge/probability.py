@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array
 from ..problem.method import METHOD, Method
 from ..problem.profile import EvidenceKind
+from ..system.arrays import Array
 
 LOCALIZED = "localized"
 AMBIGUOUS = "ambiguous"

@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Array
-from ..camera import Mount
-from ..camera.calibration import document_of as camera_document, read_mounts
-from ..errors import printable
-from ..files.json_file import document_of
 from ..geometry.pose import Pose, check_pose, heading_pitch_roll_deg
 from ..geometry.pose_gaussian import PoseGaussian
 from ..geometry.sphere import CONVENTION
-from ..photo import GpsPrior
+from ..photo.camera import Mount
+from ..photo.camera.calibration import document_of as camera_document, read_mounts
+from ..photo.photo import GpsPrior
 from ..problem.accuracy import Accuracy, Demand
+from ..system.arrays import Array
+from ..system.errors import printable
+from ..system.files.json_file import document_of
 from .accuracy_hint import explain_accuracy
 from .belief import NOTHING, UNCONFIRMED, Belief, decide
 from .pose_covariance import PoseCovariance

@@ -12,15 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Array32, Int64s
+from ..geometry.levenberg_marquardt import COUNT_SUM, GRADIENT, LOSS, MATRIX, levenberg_marquardt
 from ..geometry.nearness import MATCHED, VOTED, non_maximum_suppression
 from ..geometry.pose import Pose
 from ..geometry.robust import inline_geman_mcclure
 from ..geometry.vectors import cross, dot, minus, rotate, row
-from ..jobs.threads import Workers
-from ..kernels.jit import Scalar, inline_kernel, kernel
-from ..optimize.levenberg_marquardt import levenberg_marquardt
-from ..optimize.normal_equations import COUNT_SUM, GRADIENT, LOSS, MATRIX
+from ..system.arrays import Array, Array32, Int64s
+from ..system.jobs.threads import Workers
+from ..system.kernels.jit import Scalar, inline_kernel, kernel
 from .matching import Matches
 from .p3p import p3p
 

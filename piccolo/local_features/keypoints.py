@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from ..arrays import Array32, Bytes, Int64s, Mask
-from ..jobs.threads import Workers
+from ..system.arrays import Array32, Bytes, Int64s, Mask
+from ..system.jobs.threads import Workers
 from .perspective_view import PerspectiveView, add_margin
 
 CONTRAST = 0.006  # least of a keypoint, as OpenCV counts it: plain walls have faint ones, and they hold

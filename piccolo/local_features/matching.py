@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array32, Int32s, Mask
 from ..geometry.pose import Pose, rotate_points
-from ..kernels.jit import kernel
+from ..system.arrays import Array32, Int32s, Mask
+from ..system.kernels.jit import kernel
 from .keypoints import Keypoints
 
 # of the best distance to the best elsewhere, at most, of a distinct match (Lowe, "Distinctive Image Features

@@ -13,9 +13,9 @@ import math
 
 import numpy as np
 
-from ..arrays import Array
 from ..geometry.vectors import Triple, Vector, cross, dot, minus, row
-from ..kernels.jit import Scalar, inline_kernel, kernel
+from ..system.arrays import Array
+from ..system.kernels.jit import Scalar, inline_kernel, kernel
 
 LEAST_SINE2 = 1e-10  # of the angles of the triangle of points: below, they lie on a line
 LEAST_GAP = 5e-13  # 1 - cosine of two bearings: below a microradian they are the same

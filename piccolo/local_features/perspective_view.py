@@ -8,8 +8,8 @@ from typing import NamedTuple, TypeVar
 import cv2
 import numpy as np
 
-from ..arrays import Array, Array32, Bytes, Floats, Int64s, Mask
 from ..geometry.sphere import compute_pixels, pixel_rays
+from ..system.arrays import Array, Array32, Bytes, Floats, Int64s, Mask
 
 FIELD_DEG = 65.0  # of a view of the set that covers the sphere, across
 PICTURE_MARGIN = 8  # [px] of the sphere's picture around it, so that views may cross the seam

@@ -6,13 +6,13 @@ from typing import Any, Literal, NamedTuple
 import cv2
 import numpy as np
 
-from ..arrays import Array, Array32, Bytes, Floats, Mask
 from ..cloud.octree import Octree, collect, find_level
 from ..geometry.cone import EVERYWHERE, Cone
 from ..geometry.pose import Pose
 from ..geometry.sphere import direction_to_pixel
 from ..geometry.vectors import rotate
-from ..kernels.jit import F0, F1, HALF, Scalar, inline_kernel, kernel
+from ..system.arrays import Array, Array32, Bytes, Floats, Mask
+from ..system.kernels.jit import F0, F1, HALF, Scalar, inline_kernel, kernel
 from ..views.view import Scratch, thread_scratch
 
 DRAWN_VOXEL_PER_RANGE = 1.0 / 80.0  # largest voxel, divided by its distance

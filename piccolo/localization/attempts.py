@@ -13,12 +13,11 @@ import numpy as np
 
 from ..evidence.examine import check_prior, choose, examine
 from ..evidence.verification import Verified, draw_near, verify
-from ..jobs.threads import Once, Workers
 from ..judge.candidate import Candidate
 from ..judge.selection import is_clear, is_sure, rank
 from ..local_features.hypotheses import MatchedPose, propose_poses
 from ..local_features.matching import Matches, match_located, merge_matches
-from ..photo import NOTHING_KNOWN
+from ..photo.photo import NOTHING_KNOWN
 from ..problem.method import Method
 from ..problem.photo_images import find_all_around
 from ..problem.problem import Problem
@@ -26,6 +25,7 @@ from ..problem.profile import Beam, Tilts
 from ..problem.settings import Effort
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
+from ..system.jobs.threads import Once, Workers
 from .beam import refine_matches, refine_starts, score_mirror, score_starts
 from .means import Means
 from .search import search_poses

@@ -7,23 +7,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Int64s
 from ..evidence.examine import examine
 from ..geometry.cone import Cone
 from ..geometry.nearness import DESCENDED, DESCENDING, ONE_ANSWER, Nearness, non_maximum_suppression
 from ..geometry.pose import Pose
-from ..jobs.threads import Workers
 from ..judge.alternatives import Hypothesis, best_distinct, sort_by_score, suppress_near
 from ..judge.candidate import Candidate
-from ..kernels.jit import F0, kernel
 from ..optimize.channel_loss import ChannelProblem, descend_channels, score
-from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
-from ..panorama.texels import Texels
+from ..photo.panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
+from ..photo.panorama.texels import Texels
 from ..problem.cone import find_cone, select_cells
 from ..problem.problem import Problem
 from ..problem.profile import Beam
 from ..problem.settings import Effort
 from ..problem.stages import AROUND_MIDDLE, FINE, FIRST, MIDDLE, SECOND, Stage
+from ..system.arrays import Array, Int64s
+from ..system.jobs.threads import Workers
+from ..system.kernels.jit import F0, kernel
 from ..views.candidate_views import SEARCH_VIEW, Views
 from ..views.view import ViewArrays
 from .ladder import climb, refine

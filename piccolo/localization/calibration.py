@@ -7,10 +7,6 @@ from functools import partial
 
 import numpy as np
 
-from ..arrays import Array, Array32
-from ..camera import Camera, Mount
-from ..camera.corrections import FOCAL, Corrections
-from ..camera.model import whole_sphere
 from ..evidence.examine import examine_each
 from ..evidence.focal_length import FOCAL_WIDTHS, FocalFit, fit_focal, list_matches
 from ..evidence.lens_matches import fit_matches
@@ -26,11 +22,15 @@ from ..evidence.sphere import (
 )
 from ..geometry.pose import Pose, rotate_points
 from ..geometry.pose_gaussian import add
-from ..jobs.threads import Workers
 from ..judge.candidate import Selection
-from ..panorama import Panorama
+from ..photo.camera import Camera, Mount
+from ..photo.camera.corrections import FOCAL, Corrections
+from ..photo.camera.model import whole_sphere
+from ..photo.panorama import Panorama
 from ..problem.problem import Problem
 from ..problem.stages import Limits
+from ..system.arrays import Array, Array32
+from ..system.jobs.threads import Workers
 from .last_descent import refine_best
 
 MIN_CALIBRATED_SCORE_LEFT = 0.95  # fraction of the score that it must keep

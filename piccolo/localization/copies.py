@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from ..evidence.examine import complete, examine_each
 from ..evidence.verification import find_copies
 from ..geometry.nearness import ONE_ANSWER
-from ..jobs.threads import Workers
 from ..judge.alternatives import MAX_ALTERNATIVES, suppress_near
 from ..judge.candidate import Candidate, Selection
 from ..judge.selection import list_drawn
 from ..problem.problem import Problem
 from ..problem.settings import Effort
+from ..system.jobs.threads import Workers
 from .shape import find_alike
 
 

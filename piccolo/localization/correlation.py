@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array32, Bytes, Int8s, Int64s, Mask
-from ..jobs.threads import Workers
-from ..kernels.jit import F0, F1, kernel
+from ..system.arrays import Array32, Bytes, Int8s, Int64s, Mask
+from ..system.jobs.threads import Workers
+from ..system.kernels.jit import F0, F1, kernel
 
 EXACT = (1 << 24) - 1  # whole numbers up to this are exact in float32
 MOST_LEVEL = 127.5  # of a channel

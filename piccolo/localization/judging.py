@@ -12,7 +12,6 @@ from ..evidence.examine import complete
 from ..evidence.focal_length import FocalFit, doubt_unconfirmed, fit_focal
 from ..evidence.measuring import Fit, describe_geometry, measure
 from ..geometry.pose_gaussian import PoseGaussian
-from ..jobs.threads import Workers
 from ..judge.belief import Belief, make_belief
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Case
@@ -22,6 +21,7 @@ from ..judge.result import Result, nothing_found
 from ..judge.selection import assess, credit_copies, is_mirrored
 from ..problem.accuracy import Demand
 from ..problem.problem import Problem
+from ..system.jobs.threads import Workers
 from .copies import list_reported
 from .ladder import settle
 from .means import Means, Step, describe_selection

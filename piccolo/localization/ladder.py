@@ -7,22 +7,22 @@ from functools import partial
 
 import numpy as np
 
-from ..arrays import Array, Array32, Int32s
 from ..evidence.comparison import mask_occluders
 from ..evidence.examine import examine
+from ..geometry.levenberg_marquardt import retract
 from ..geometry.pose import Pose, orthonormal
-from ..jobs.threads import Workers
 from ..judge.alternatives import Hypothesis
 from ..judge.candidate import Candidate
-from ..kernels.jit import kernel
 from ..optimize.channel_loss import ChannelProblem, descend_channels, score
-from ..optimize.levenberg_marquardt import retract
-from ..panorama.local_normalization import LEVELS_PER_UNIT, to_levels
-from ..panorama.texels import Texels
+from ..photo.panorama.local_normalization import LEVELS_PER_UNIT, to_levels
+from ..photo.panorama.texels import Texels
 from ..problem.method import Method
 from ..problem.problem import Problem
 from ..problem.profile import VIEWS
 from ..problem.stages import AROUND_FINE, AROUND_MIDDLE, FINE, FULL, LAST, MIDDLE, Limits, Stage
+from ..system.arrays import Array, Array32, Int32s
+from ..system.jobs.threads import Workers
+from ..system.kernels.jit import kernel
 from ..views.points_around import PLACE_SPACING
 from ..views.view import Cells
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 from functools import partial
 
 from ..evidence.examine import choose, complete
-from ..jobs.threads import Workers
 from ..judge.candidate import Candidate, Selection
 from ..judge.selection import count_matches, is_faint, rank
 from ..problem.method import Method
 from ..problem.problem import Problem
+from ..system.jobs.threads import Workers
 from .ladder import climb_to_full, climb_unoccluded, settle
 
 HOPELESS_SCORE = 0.02  # black, white and noisy pictures, and most photos of other places, have less

@@ -8,7 +8,6 @@ from functools import partial
 from ..evidence.focal_length import WIDE
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
-from ..jobs.threads import Stopwatch, one_blas_thread
 from ..judge.alternatives import MAX_ALTERNATIVES
 from ..judge.belief import NOTHING, make_belief
 from ..judge.by_others import share_place
@@ -18,13 +17,14 @@ from ..judge.reasons import Reason
 from ..judge.result import Result, nothing_found
 from ..judge.result_parts import Alternative, FocalLength
 from ..judge.selection import is_faint, rank
-from ..panorama import Panorama
-from ..panorama.edges import find_axes
-from ..photo import Prior
+from ..photo.panorama import Panorama
+from ..photo.panorama.edges import find_axes
+from ..photo.photo import Prior
 from ..problem.prior import apply_prior, nothing_allowed
 from ..problem.problem import Problem, prepare_problem
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
+from ..system.jobs.threads import Stopwatch, one_blas_thread
 from .attempts import Attempt, plan_attempts, search_beyond_prior
 from .calibration import calibrate, calibrate_sphere
 from .judging import Found, judge

@@ -4,10 +4,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from ..jobs.threads import Stopwatch, Workers
 from ..judge.candidate import Candidate, Selection
 from ..problem.problem import Problem
 from ..problem.settings import Effort
+from ..system.jobs.threads import Stopwatch, Workers
 
 Step = dict[str, Any]
 

@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Array
 from ..evidence.examine import count_agreeing
 from ..geometry.pose import Pose, uniform_yaws
-from ..jobs.threads import Workers
 from ..judge.candidate import Candidate
 from ..judge.selection import explains_more
 from ..problem.photo_images import MIRROR
 from ..problem.problem import Problem
 from ..problem.settings import Effort
+from ..system.arrays import Array
+from ..system.jobs.threads import Workers
 from .attempts import FIRST_BEAM
 from .beam import descend_briefly, refine_starts, score_briefly, score_near
 from .search import search_poses

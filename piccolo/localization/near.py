@@ -11,13 +11,13 @@ from ..evidence.verification import draw_near, verify
 from ..geometry.nearness import RIGHT
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
-from ..jobs.threads import Workers
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import UNKNOWN_ERRORS
 from ..judge.probability import Standing, posterior
 from ..judge.selection import assess_alone
 from ..problem.problem import Problem
 from ..problem.stages import FULL, NEARLY
+from ..system.jobs.threads import Workers
 from .ladder import climb_from_afar, refine, settle
 from .last_descent import HOPELESS_SCORE
 

@@ -4,11 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..camera import Calibration
 from ..geometry.colors import Labels
 from ..judge.result import Result
-from ..panorama import Panorama, read_panorama
-from ..photo import Photo
+from ..photo.camera import Calibration
+from ..photo.panorama import Panorama, read_panorama
+from ..photo.photo import Photo
 
 
 def photo_of(result: Result, path: Path | None = None) -> Photo:

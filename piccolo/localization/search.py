@@ -4,21 +4,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Array, Int32s, Int64s
 from ..geometry.nearness import non_maximum_suppression
 from ..geometry.pose import Pose, R_cam_from_angles, uniform_rotations, uniform_yaws
 from ..geometry.sphere import SEARCH_RINGS, make_grid, whole_areas, wider_cells
-from ..jobs.memory import check_memory
-from ..jobs.threads import Workers
-from ..kernels.jit import F0, kernel
-from ..panorama.local_normalization import sample_channels
-from ..panorama.texels import Texels
+from ..photo.panorama.local_normalization import sample_channels
+from ..photo.panorama.texels import Texels
 from ..problem.method import Method
 from ..problem.prior import allow_rotations
 from ..problem.problem import Problem
 from ..problem.profile import Tilts
 from ..problem.settings import Effort
 from ..scan_map.scan_map import ScanMap
+from ..system.arrays import Array, Int32s, Int64s
+from ..system.jobs.memory import check_memory
+from ..system.jobs.threads import Workers
+from ..system.kernels.jit import F0, kernel
 from ..views.candidate_views import WIDE_RINGS
 from .correlation import VIEWS_A_PRODUCT, Samples, correlate_pairs, masked_correlation, weigh_by_area
 

@@ -5,17 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Array
 from ..evidence.comparison import FINE_VIEW, compare
 from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose, uniform_yaws, yaw_rotation
 from ..geometry.sphere import find_cell, pixel_rays
-from ..jobs.threads import Workers
 from ..judge.candidate import Candidate, Selection
-from ..panorama.gpano import attitude_of_gravity
+from ..photo.panorama.gpano import attitude_of_gravity
 from ..problem.problem import Problem, prepare_problem
 from ..problem.profile import choose_profile
 from ..problem.settings import Effort
+from ..system.arrays import Array
+from ..system.jobs.threads import Workers
 from ..views.points_around import round_position
 from .attempts import FIRST_BEAM
 from .beam import refine_starts, score_starts

@@ -9,14 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Array32, Int32s, Int64s
+from ..geometry.levenberg_marquardt import COUNT_SUM, LOSS, levenberg_marquardt
 from ..geometry.robust import inline_geman_mcclure
 from ..geometry.sphere import BLOCK_RINGS, make_grid
-from ..kernels.jit import Scalar, inline_kernel, kernel
-from ..panorama.local_normalization import ZERO_LEVEL
-from ..panorama.texels import TEXEL_CHUNK, make_chunk, project, sample
-from .levenberg_marquardt import levenberg_marquardt
-from .normal_equations import COUNT_SUM, LOSS, block_adder
+from ..photo.panorama.local_normalization import ZERO_LEVEL
+from ..photo.panorama.texels import TEXEL_CHUNK, make_chunk, project, sample
+from ..system.arrays import Array, Array32, Int32s, Int64s
+from ..system.kernels.jit import Scalar, inline_kernel, kernel
+from .normal_equations import block_adder
 
 NUM_BLOCKS = len(make_grid(BLOCK_RINGS))
 NUM_MOMENTS = 10

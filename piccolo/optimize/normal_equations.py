@@ -11,16 +11,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..arrays import Array, Array32, Int32s
+from ..geometry.levenberg_marquardt import NUM_SUMS
 from ..geometry.sphere import pixel_jacobian
-from ..kernels.jit import F0, Scalar, inline_kernel, kernel
-from ..panorama.texels import TEXEL_CHUNK, Projected, blend_with_gradient, is_valid, make_chunk, project
-
-NUM_SUMS = 29  # loss, count, gradient (6), upper triangle of the normal matrix (21)
-LOSS = 0  # where they begin
-COUNT_SUM = 1
-GRADIENT = 2
-MATRIX = 8
+from ..photo.panorama.texels import TEXEL_CHUNK, Projected, blend_with_gradient, is_valid, make_chunk, project
+from ..system.arrays import Array, Array32, Int32s
+from ..system.kernels.jit import F0, Scalar, inline_kernel, kernel
 
 Colors = TypeVar("Colors")
 Coordinates = tuple[Array32, Array32, Array32]  # x, y, z (N,)

@@ -14,12 +14,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..arrays import Array, Array32, Int32s
-from ..cloud.soa import FARTHEST_POINT, PackedPoints
+from ..geometry.levenberg_marquardt import GRADIENT, MATRIX, NUM_SUMS
+from ..geometry.points import FARTHEST_POINT, PackedPoints
 from ..geometry.pose import Pose
 from ..geometry.robust import inline_absolute
-from ..kernels.jit import F0, F1, Scalar, inline_kernel, kernel
-from ..panorama.texels import (
+from ..photo.panorama.texels import (
     TEXEL_CHUNK,
     Texels,
     bilinear_weights,
@@ -29,7 +28,9 @@ from ..panorama.texels import (
     make_chunk,
     project,
 )
-from .normal_equations import GRADIENT, MATRIX, NUM_SUMS, block_adder
+from ..system.arrays import Array, Array32, Int32s
+from ..system.kernels.jit import F0, F1, Scalar, inline_kernel, kernel
+from .normal_equations import block_adder
 
 POINTS_A_SUM = 4096
 # A pose at which masked pixels hide more of the cloud has no loss. If only a part of the panorama is valid,

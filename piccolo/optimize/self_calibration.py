@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Array32, Int64s
 from ..geometry.robust import inline_geman_mcclure
 from ..geometry.sphere import pixel_jacobian
-from ..kernels.jit import F0, kernel
-from ..panorama.texels import TEXEL_CHUNK, blend_with_gradient, is_valid, make_chunk, project
+from ..photo.panorama.texels import TEXEL_CHUNK, blend_with_gradient, is_valid, make_chunk, project
+from ..system.arrays import Array, Array32, Int64s
+from ..system.kernels.jit import F0, kernel
 from .channel_loss import ChannelProblem
 
 NUM_OF_POSE = 6

@@ -5,12 +5,12 @@ from bisect import bisect_right
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from ..arguments import check_fields
-from ..arrays import Array
-from ..errors import InputError
 from ..geometry.nearness import Nearness
 from ..geometry.pose import MAX_DISTANCE, Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_of_ball, probability_of_turn
+from ..system.arguments import check_fields
+from ..system.arrays import Array
+from ..system.errors import InputError
 
 ROUND = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 25.0, 50.0)  # [m] or [deg] that are proposed
 FREE_DEG = 180.0  # of a rotation that may be any

@@ -5,12 +5,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, Int64s
 from ..geometry.cone import Cone, cone_around
 from ..geometry.sphere import pixel_rays
 from ..geometry.vectors import rotate
-from ..kernels.jit import inline_kernel
-from ..panorama.texels import Texels, find_valid
+from ..photo.panorama.texels import Texels, find_valid
+from ..system.arrays import Array, Int64s
+from ..system.kernels.jit import inline_kernel
 
 CONE_MARGIN = math.radians(20.0)  # that a camera turns in a descent, at most
 

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from ..arguments import check_fields
+from ..system.arguments import check_fields
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ..arrays import Array, Mask
 from ..geometry.cone import EVERYWHERE, Cone
 from ..geometry.pose import Pose, rotate_points
 from ..geometry.sphere import compute_indices, make_grid
-from ..jobs.threads import Once, Workers
 from ..local_features.keypoints import Keypoints, find_keypoints
 from ..local_features.perspective_view import (
     PerspectiveView,
@@ -20,11 +18,13 @@ from ..local_features.perspective_view import (
     list_sides,
     view_around,
 )
-from ..panorama import Panorama
-from ..panorama.edges import soften
-from ..panorama.local_normalization import normalize_panorama
-from ..panorama.model import resize
-from ..panorama.texels import Texels, find_valid, pack_texels
+from ..photo.panorama import Panorama
+from ..photo.panorama.edges import soften
+from ..photo.panorama.local_normalization import normalize_panorama
+from ..photo.panorama.model import resize
+from ..photo.panorama.texels import Texels, find_valid, pack_texels
+from ..system.arrays import Array, Mask
+from ..system.jobs.threads import Once, Workers
 from .cone import find_cone
 from .profile import ImageScale, ImageScales
 from .stages import ImageName

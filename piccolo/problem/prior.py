@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from ..arrays import Array, Mask
-from ..photo import Prior
+from ..photo.photo import Prior
 from ..scan_map.camera_positions import COARSE_SPACING, heights_above_floor
 from ..scan_map.scan_map import ScanMap, candidates_within
+from ..system.arrays import Array, Mask
 
 
 def allow_by_option(scan_map: ScanMap, prior: Prior) -> dict[str, Mask]:

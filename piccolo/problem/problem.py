@@ -6,18 +6,18 @@ from functools import partial
 
 import numpy as np
 
-from ..arrays import Array, Array32
-from ..cloud.soa import PackedPoints
+from ..geometry.points import PackedPoints
 from ..geometry.pose import Gravity, Pose
-from ..jobs.threads import Once
 from ..local_features.matching import Matches
-from ..panorama import Panorama
-from ..panorama.edges import draw_edges
-from ..panorama.gpano import rotation_to_level
-from ..panorama.model import shrink
-from ..panorama.texels import Texels, pack_texels
-from ..photo import NOTHING_KNOWN, Prior
+from ..photo.panorama import Panorama
+from ..photo.panorama.edges import draw_edges
+from ..photo.panorama.gpano import rotation_to_level
+from ..photo.panorama.model import shrink
+from ..photo.panorama.texels import Texels, pack_texels
+from ..photo.photo import NOTHING_KNOWN, Prior
 from ..scan_map.scan_map import ScanMap
+from ..system.arrays import Array, Array32
+from ..system.jobs.threads import Once
 from ..views.points_around import Place, RecentViews, round_position
 from ..views.view import Cells, ViewConfig, normalize_view
 from .method import METHOD, Method

@@ -3,10 +3,10 @@
 from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
-from ..arguments import MIN_CONFIDENCE, check_confidence, check_fields
-from ..errors import InputError
 from ..geometry.pose import Gravity
-from ..photo import NOTHING_KNOWN, Prior
+from ..photo.photo import NOTHING_KNOWN, Prior
+from ..system.arguments import MIN_CONFIDENCE, check_confidence, check_fields
+from ..system.errors import InputError
 from .accuracy import PAPER_ACCURACY, Accuracy, Demand
 from .method import METHOD, Method
 

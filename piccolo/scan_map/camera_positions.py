@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Array32, Floats, Int64s, Mask
 from ..cloud.octree import Octree
-from ..errors import InputError
 from ..geometry.sphere import whole_areas
-from ..jobs.threads import Workers
+from ..system.arrays import Array, Array32, Floats, Int64s, Mask
+from ..system.errors import InputError
+from ..system.jobs.threads import Workers
 from ..views.view import VIEWS_A_TASK, ViewConfig, ranges_around
 
 MIN_CLEARANCE = 0.25  # [m] a camera is not nearer to a surface

@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Array, Array32, Int32s, Int64s
 from ..cloud.octree import Octree
 from ..geometry.pose import Pose
 from ..geometry.sphere import compute_indices, direction_to_pixel, find_cell, pixel_rays
 from ..geometry.vectors import minus, row
-from ..jobs.threads import Once, Workers
-from ..kernels.jit import kernel, whole
 from ..local_features.keypoints import find_keypoints
 from ..local_features.matching import Located
 from ..local_features.perspective_view import cover_sphere
 from ..local_features.view_image import render_gray
+from ..system.arrays import Array, Array32, Int32s, Int64s
+from ..system.jobs.threads import Once, Workers
+from ..system.kernels.jit import kernel, whole
 from ..views.candidate_views import SEARCH_VIEW
 from ..views.view import ranges_around
 

@@ -21,17 +21,26 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..arrays import Array, Array32, Int32s, Values
 from ..cloud.octree import Octree
 from ..cloud.readers.npz import naming_damage
 from ..cloud.voxels import NUM_LEVELS, PHASE, QUANTUM_BITS, WINDOW
-from ..errors import InputError
-from ..files.array_archive import ArrayArchive, write_archive
-from ..files.atomic import IS_WINDOWS, replacing
-from ..files.cache import WRITABLE, is_own, make_key, mark_used, own_names, private_folder, recall, remember
 from ..geometry.pose import check_rotation
 from ..geometry.sphere import make_grid
-from ..kernels.jit import F0, inline_kernel, kernel
+from ..system.arrays import Array, Array32, Int32s, Values
+from ..system.errors import InputError
+from ..system.files.array_archive import ArrayArchive, write_archive
+from ..system.files.atomic import IS_WINDOWS, replacing
+from ..system.files.cache import (
+    WRITABLE,
+    is_own,
+    make_key,
+    mark_used,
+    own_names,
+    private_folder,
+    recall,
+    remember,
+)
+from ..system.kernels.jit import F0, inline_kernel, kernel
 from ..views.candidate_views import WIDE_RINGS, CandidateViews
 from .drawn_places import DrawnPlaces
 from .scan_map import MAX_SCANS, ScanMap, is_name, sparse_candidates

@@ -9,20 +9,27 @@ from pathlib import Path
 import numpy as np
 
 from ..cloud.settings import BY_FILE, IN_COLORS, CloudSettings, R_z_from_axis
-from ..cloud.soa import LocalCloud, pack_points
 from ..cloud.stream import open_cloud, read_crs
-from ..errors import InputError
-from ..files.cache import cache_root, digest_of_sources, in_words, mark_used, own_folder, sha256_of_files
+from ..geometry.points import LocalCloud, pack_points
 from ..geometry.pose import rotate_points
-from ..jobs.threads import Stopwatch, Workers
-from ..photo import NOTHING_KNOWN, Prior
+from ..photo.photo import NOTHING_KNOWN, Prior
+from ..system.errors import InputError
+from ..system.files.cache import (
+    cache_root,
+    digest_of_sources,
+    in_words,
+    mark_used,
+    own_folder,
+    sha256_of_files,
+)
+from ..system.jobs.threads import Stopwatch, Workers
 from .map_file import FORMAT, NAME, is_map_file, load_map, save_map
 from .scan_addition import add_scan
 from .scan_map import ScanMap, name_scan, prepare_map
 
 FOLDER = "piccolo-maps"  # within the folder that the user names
 # What makes a map: folders of the package. The cache makes maps anew when one of their files has changed.
-MAKERS = ("cloud", "geometry", "gravity", "local_features", "optimize", "panorama", "scan_map", "views")
+MAKERS = ("cloud", "geometry", "local_features", "photo/panorama", "scan_map", "views")
 
 
 @dataclass(frozen=True)

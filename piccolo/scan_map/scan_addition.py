@@ -9,14 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Int64s, Mask, Uint16s, Values
 from ..cloud.octree import Octree, build_octree
 from ..cloud.stream import CloudStream
 from ..cloud.surfaces import surface_variance
 from ..cloud.voxels import LEAF_SIZE, WINDOW, Voxels, join_voxels
-from ..errors import InputError
 from ..geometry.sphere import whole_areas
-from ..jobs.threads import Stopwatch, Workers
+from ..system.arrays import Array, Int64s, Mask, Uint16s, Values
+from ..system.errors import InputError
+from ..system.jobs.threads import Stopwatch, Workers
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, WideViews, render_wide
 from ..views.view import VIEWS_A_TASK, ranges_around
 from .camera_positions import CLEARANCE_VOXEL, MIN_CLEARANCE, Box, candidate_centers

@@ -6,18 +6,18 @@ from functools import cached_property
 
 import numpy as np
 
-from ..arrays import Array, Bytes, Int8s, Int64s, Mask, Uint16s
+from ..cloud.gravity import find_up, find_yaw_of_walls
 from ..cloud.layers import NO_LAYERS, describe_layers, find_layers
 from ..cloud.octree import Octree, build_octree
 from ..cloud.settings import R_z_from_axis, UpAxis
-from ..cloud.soa import MapFrame, PackedPoints, pack_points
 from ..cloud.stream import CloudStream
 from ..cloud.surfaces import displacement, paint_shape, surface_variance
-from ..errors import InputError
+from ..geometry.points import MapFrame, PackedPoints, pack_points
 from ..geometry.pose import Pose
-from ..gravity.alignment import find_up, find_yaw_of_walls
-from ..jobs.threads import Stopwatch, Workers
-from ..photo import NOTHING_KNOWN, Prior
+from ..photo.photo import NOTHING_KNOWN, Prior
+from ..system.arrays import Array, Bytes, Int8s, Int64s, Mask, Uint16s
+from ..system.errors import InputError
+from ..system.jobs.threads import Stopwatch, Workers
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, render_wide
 from .camera_positions import COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
 from .drawn_places import DrawnPlaces

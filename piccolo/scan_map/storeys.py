@@ -5,9 +5,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ..arrays import Array, Array32, Int64s, Mask
 from ..cloud.octree import Octree
-from ..cloud.soa import FARTHEST_POINT
+from ..geometry.points import FARTHEST_POINT
+from ..system.arrays import Array, Array32, Int64s, Mask
 from .camera_positions import SURFACE_VOXEL
 
 HEADROOM_VOXELS = 11  # voxels above a surface that are empty, 1.8 m

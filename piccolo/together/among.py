@@ -9,17 +9,17 @@ from typing import NamedTuple
 
 from ..evidence.covariance import estimate_errors
 from ..evidence.examine import complete, examine
-from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.candidate import Selection
 from ..judge.result import Result
 from ..local_features.keypoints import Keypoints
 from ..localization.judging import Found
 from ..localization.localize import prepare_search
 from ..localization.means import Means
-from ..panorama import Panorama
+from ..photo.panorama import Panorama
 from ..problem.problem import Problem
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
+from ..system.jobs.threads import Stopwatch, Workers, one_blas_thread
 from .beside import recall_gaussian
 from .group import NUM_ANCHORS, Grouped, localize_linked
 from .links import FIRM, WEAK, Placed, find_links, match_each, spread

@@ -17,7 +17,6 @@ from ..evidence.verification import match_beside, match_covariance, place_keypoi
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, turn_positions
-from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.by_others import believe_beside
 from ..judge.conclude import take_pose
 from ..judge.pose_covariance import PoseCovariance
@@ -29,12 +28,13 @@ from ..localization.judging import Found, judge
 from ..localization.last_descent import refine_best
 from ..localization.localize import fit_camera
 from ..localization.means import Means
-from ..panorama import Panorama
+from ..photo.panorama import Panorama
 from ..problem.method import Method
 from ..problem.prior import apply_prior
 from ..problem.problem import Problem, prepare_problem
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
+from ..system.jobs.threads import Stopwatch, Workers, one_blas_thread
 
 MOST_BESIDE = 3  # photos whose matches count, those with the most
 

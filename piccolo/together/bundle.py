@@ -14,13 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array
 from ..evidence.examine import complete, examine
 from ..evidence.focal_length import FocalFit
 from ..geometry.nearness import RIGHT
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, subtract
-from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.by_others import LOCAL_ERRORS, Shares, believe_together
 from ..judge.candidate import Selection
 from ..judge.consensus import MOST_CONFLICT
@@ -29,10 +27,12 @@ from ..judge.result import Result, nothing_found
 from ..localization.calibration import calibrate
 from ..localization.judging import Found, judge_together
 from ..localization.means import NO_TRACE, Means, Trace
-from ..panorama import Panorama
+from ..photo.panorama import Panorama
 from ..problem.accuracy import Demand
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
+from ..system.arrays import Array
+from ..system.jobs.threads import Stopwatch, Workers, one_blas_thread
 from .bundle_adjustment import (
     NUM_ADJUSTMENT_ROUNDS,
     Adjusted,

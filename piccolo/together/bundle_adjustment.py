@@ -12,12 +12,12 @@ from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
-from ..arguments import check_kind
-from ..arrays import Array
+from ..geometry.gauss_newton import Equations, minimize, sum_observations, whiten
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LIKELY, LOOSE, PoseGaussian, add, differentiate, mean_of, subtract
 from ..geometry.robust import redescend
-from ..optimize.gauss_newton import Equations, minimize, sum_observations, whiten
+from ..system.arguments import check_kind
+from ..system.arrays import Array
 
 RelativeScale = Literal["metres", "unknown"]  # of the positions of relative poses
 UNKNOWN_SCALE = 10.0  # deviation of the logarithm of a scale that is not known

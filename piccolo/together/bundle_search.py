@@ -8,14 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array
 from ..evidence.covariance import estimate_errors
 from ..evidence.examine import complete, count_agreeing, examine
 from ..evidence.verification import draw_near, verify
 from ..geometry.nearness import ONE_IN_BUNDLE, RIGHT
 from ..geometry.pose import Pose, angle_between
 from ..geometry.pose_gaussian import PoseGaussian
-from ..jobs.threads import Workers
 from ..judge.by_others import LEAST_NONE, MISSED, local_share
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Errors
@@ -26,6 +24,8 @@ from ..localization.ladder import refine
 from ..localization.last_descent import HOPELESS_SCORE
 from ..problem.problem import Problem
 from ..problem.stages import FINE
+from ..system.arrays import Array
+from ..system.jobs.threads import Workers
 from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
 from .members import Member
 

@@ -12,11 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array
 from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LIKELY, PoseGaussian
-from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.by_others import LOCAL_ERRORS, MISSED, Shares
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result
@@ -24,6 +22,8 @@ from ..local_features.hypotheses import count_matches
 from ..localization.means import Means
 from ..problem.accuracy import Demand
 from ..scan_map.scan_map import ScanMap
+from ..system.arrays import Array
+from ..system.jobs.threads import Stopwatch, Workers, one_blas_thread
 from .bundle import EVEN_ODDS, judge_placed, place_between, weigh_local
 from .bundle_search import NUM_BUNDLES, Support, find_supports, weigh_bundles
 from .links import (

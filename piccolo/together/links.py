@@ -15,15 +15,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array32
 from ..evidence.verification import find_ranges
 from ..geometry.pose import Pose, rotate_points
 from ..geometry.sphere import compute_indices
-from ..jobs.threads import Workers
 from ..local_features.hypotheses import count_matches, propose_poses
 from ..local_features.keypoints import Keypoints
 from ..local_features.matching import Located, Matches, match_pictures, merge_matches, pair
 from ..problem.problem import Problem
+from ..system.arrays import Array32
+from ..system.jobs.threads import Workers
 from .relation import Relation, relate
 
 LEAST_LINKED = 6  # matches of two photos that may show the same

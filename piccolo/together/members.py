@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose
-from ..jobs.memory import check_memory
-from ..jobs.threads import Stopwatch, Workers
 from ..judge.candidate import Candidate
 from ..judge.consensus import MOST_CONFLICT, Consensus
 from ..judge.probability import LOCALIZED
@@ -22,9 +20,11 @@ from ..localization.localize import (
     prepare_search,
 )
 from ..localization.means import NO_TRACE, Means, Trace
-from ..panorama import Panorama
+from ..photo.panorama import Panorama
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
+from ..system.jobs.memory import check_memory
+from ..system.jobs.threads import Stopwatch, Workers
 
 
 @dataclass(frozen=True)

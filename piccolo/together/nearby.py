@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Array
 from ..geometry.pose import Pose
 from ..judge.by_others import LEAST_NONE, believe_nearby
 from ..judge.probability import LOCALIZED
@@ -18,6 +17,7 @@ from ..localization.localize import find, prepare_search
 from ..localization.means import Means
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
+from ..system.arrays import Array
 from .members import Shot
 
 REACH = 1.0  # chosen: [m] of a photo that is taken with others, from the nearest of these

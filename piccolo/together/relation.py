@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array
 from ..evidence.verification import DRAWN_INFLATION, match_covariance
 from ..geometry.pose import Pose, rotate_points
 from ..geometry.pose_gaussian import add, differentiate_rays, subtract
 from ..geometry.robust import geman_mcclure
 from ..local_features.hypotheses import COS_EXACT, REFINE_SCALE, find_inliers, refine_on
 from ..local_features.matching import Matches
+from ..system.arrays import Array
 
 NUM_WEAK = 2  # directions in which a pose is tried
 TRIED = (0.15, 0.3)  # [m] on both sides of it

@@ -13,14 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, Array32, Bytes, Int8s, Int64s, Mask
 from ..cloud.octree import Octree
 from ..geometry.cone import EVERYWHERE
 from ..geometry.sphere import SEARCH_RINGS, make_grid
-from ..jobs.memory import check_memory
-from ..jobs.threads import Workers
-from ..kernels.jit import F0, F1, HALF, Scalar, inline_kernel, kernel
-from ..panorama.local_normalization import LEVELS_PER_UNIT
+from ..photo.panorama.local_normalization import LEVELS_PER_UNIT
+from ..system.arrays import Array, Array32, Bytes, Int8s, Int64s, Mask
+from ..system.jobs.memory import check_memory
+from ..system.jobs.threads import Workers
+from ..system.kernels.jit import F0, F1, HALF, Scalar, inline_kernel, kernel
 from .view import (
     VIEWS_A_TASK,
     Scratch,

@@ -9,11 +9,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..arrays import Array32, Floats, Int32s
 from ..cloud.surfaces import rise
 from ..geometry.colors import colors_of_edges
 from ..geometry.sphere import cells_around, make_grid
-from ..panorama.edges import COS_UPRIGHT_EDGE
+from ..photo.panorama.edges import COS_UPRIGHT_EDGE
+from ..system.arrays import Array32, Floats, Int32s
 
 FULL_BEND = 0.07  # of the inverse range from cell to cell; the strength is the root of the fraction
 FAR_BELOW = -1e12  # so far below that no value interpolated with it is positive

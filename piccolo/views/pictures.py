@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, Array32, Bytes, Mask
-from ..camera import Camera
-from ..cloud.soa import PackedPoints
+from ..geometry.points import PackedPoints
 from ..geometry.pose import Pose
 from ..geometry.sphere import compute_pixels
-from ..jobs.threads import Workers
-from ..panorama import Panorama
-from ..panorama.model import resize
+from ..photo.camera import Camera
+from ..photo.panorama import Panorama
+from ..photo.panorama.model import resize
+from ..system.arrays import Array, Array32, Bytes, Mask
+from ..system.jobs.threads import Workers
 from .surfels import render_points
 from .zbuffer import View
 

@@ -8,13 +8,13 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from ..arrays import Array32, Int32s, Mask
 from ..cloud.octree import Octree, collect
-from ..cloud.soa import PackedPoints, pack_points
 from ..geometry.cone import EVERYWHERE, Cone
+from ..geometry.points import PackedPoints, pack_points
 from ..geometry.pose import Pose
-from ..kernels.jit import F0, F1, HALF, inline_kernel, kernel
-from ..panorama.local_normalization import opponent, zscore
+from ..photo.panorama.local_normalization import opponent, zscore
+from ..system.arrays import Array32, Int32s, Mask
+from ..system.kernels.jit import F0, F1, HALF, inline_kernel, kernel
 from .view import (
     Cells,
     Center,

@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, Array32, Int32s, Int64s, Mask
-from ..cloud.soa import PackedPoints
+from ..geometry.points import PackedPoints
 from ..geometry.pose import Pose
 from ..geometry.sphere import compute_rays, direction_to_pixel
-from ..jobs.threads import Workers
-from ..kernels.jit import F0, F1, Scalar, inline_kernel, kernel
-from ..panorama.texels import channel
+from ..photo.panorama.texels import channel
+from ..system.arrays import Array, Array32, Int32s, Int64s, Mask
+from ..system.jobs.threads import Workers
+from ..system.kernels.jit import F0, F1, Scalar, inline_kernel, kernel
 from .zbuffer import Coordinates, View, indices_in_front, nearest_depth
 
 NUM_SURFEL_NEIGHBORS = 10

@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Array32, Floats, Int32s, Mask
 from ..cloud.octree import MAX_NODES, Octree, collect
 from ..geometry.cone import EVERYWHERE, Cone
 from ..geometry.sphere import BLOCK_RINGS, PI, atan2, find_cell, interpolation, make_grid, make_neighbors
-from ..kernels.jit import F0, F1, HALF, kernel, whole
-from ..panorama.local_normalization import mean_and_inverse_std, opponent, zscore
+from ..photo.panorama.local_normalization import mean_and_inverse_std, opponent, zscore
+from ..system.arrays import Array, Array32, Floats, Int32s, Mask
+from ..system.kernels.jit import F0, F1, HALF, kernel, whole
 from .edges import draw_edges
 from .zbuffer import VISIBLE_FACTOR
 

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, Array32, Int32s, Int64s, Mask
-from ..cloud.soa import PackedPoints
+from ..geometry.points import PackedPoints
 from ..geometry.pose import Pose
 from ..geometry.sphere import direction_to_pixel, solid_angles
-from ..kernels.jit import kernel, whole
-from ..panorama.texels import Pose32, channel, in_camera, pose_float32
+from ..photo.panorama.texels import Pose32, channel, in_camera, pose_float32
+from ..system.arrays import Array, Array32, Int32s, Int64s, Mask
+from ..system.kernels.jit import kernel, whole
 
 Coordinates = tuple[Array32, Array32, Array32]  # x, y, z (N,) [m]
 DEPTH_CHUNK = 4096

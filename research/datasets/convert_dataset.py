@@ -14,22 +14,22 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from piccolo.arrays import Array
 from piccolo.cli.command import Arguments, add_command, check_folder_name, command, option
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.point_validator import PointValidator
 from piccolo.cloud.readers.reader import POINTS_A_CHUNK
 from piccolo.cloud.settings import IN_COLORS
-from piccolo.cloud.soa import pack_points
 from piccolo.cloud.stream import open_cloud, open_source
 from piccolo.cloud.writers import vertex_rows, writing_ply
-from piccolo.errors import InputError, unreadable
 from piccolo.evidence.occlusion import AGREEMENT_WIDTH, measure_agreement
-from piccolo.files.atomic import check_output_folder, replacing_folder, write_atomically
+from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import Pose, move, transform_points
-from piccolo.jobs.threads import Progress, Workers
-from piccolo.panorama import read_panorama
-from piccolo.panorama.model import shrink
+from piccolo.photo.panorama import read_panorama
+from piccolo.photo.panorama.model import shrink
+from piccolo.system.arrays import Array
+from piccolo.system.errors import InputError, unreadable
+from piccolo.system.files.atomic import check_output_folder, replacing_folder, write_atomically
+from piccolo.system.jobs.threads import Progress, Workers
 from piccolo.views.pictures import encode_image
 
 from ..scene import CLOUD_NAME, QUERIES_NAME, Query, Scene, read_scene, write_queries

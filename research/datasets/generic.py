@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from piccolo.arguments import PICTURES
-from piccolo.errors import InputError
-from piccolo.files.json_file import read_json, read_text
 from piccolo.geometry.pose import Pose, rotation_from_quaternion_wxyz
+from piccolo.system.arguments import PICTURES
+from piccolo.system.errors import InputError
+from piccolo.system.files.json_file import read_json, read_text
 
 from . import model
 

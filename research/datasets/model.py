@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from piccolo.arrays import Array, Uint16s
 from piccolo.cloud.stream import FORMATS
-from piccolo.errors import InputError
-from piccolo.files.json_file import read_text
 from piccolo.geometry.pose import CAMERA_AXES, OPENGL_FROM_CAM, Pose, check_transform
-from piccolo.panorama.picture import read_picture
+from piccolo.photo.panorama.picture import read_picture
+from piccolo.system.arrays import Array, Uint16s
+from piccolo.system.errors import InputError
+from piccolo.system.files.json_file import read_text
 
 Labels = Uint16s  # (H, W) the class of each pixel, 0 where unknown
 SUFFIXES = frozenset().union(*(f.suffixes for f in FORMATS)) - {".csv"}  # as these hold poses too

@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from piccolo.arguments import PICTURES
-from piccolo.arrays import Uint16s
-from piccolo.errors import InputError
-from piccolo.files.json_file import read_json
 from piccolo.geometry.pose import Pose, move, yaw_rotation
+from piccolo.system.arguments import PICTURES
+from piccolo.system.arrays import Uint16s
+from piccolo.system.errors import InputError
+from piccolo.system.files.json_file import read_json
 
 from . import model
 

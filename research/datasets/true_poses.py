@@ -5,9 +5,9 @@ from dataclasses import replace
 
 from piccolo import InputError, Result
 from piccolo.cli.command import Arguments, check_outputs, check_suffix, checking_options, command, option
-from piccolo.files.atomic import write_lines
 from piccolo.geometry.pose import move
 from piccolo.judge.probability import LOCALIZED
+from piccolo.system.files.atomic import write_lines
 
 from ..scene import QUERIES_NAME, Scene, find_scenes, input_files, write_queries
 from .model import read_matrix

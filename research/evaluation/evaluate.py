@@ -28,17 +28,17 @@ from piccolo.cli.command import (
     command,
     option,
 )
-from piccolo.errors import InputError
-from piccolo.files.atomic import check_output, is_stream, write_atomically
-from piccolo.files.line_file import open_locked
-from piccolo.jobs.cluster import Cluster
-from piccolo.jobs.interruption import Interruption, interruptible
-from piccolo.jobs.memory import limit_memory
-from piccolo.jobs.threads import Workers
 from piccolo.judge.result import UNREADABLE
 from piccolo.problem.accuracy import PAPER_ACCURACY
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.scan_map.open_map import scan_sha256_of
+from piccolo.system.errors import InputError
+from piccolo.system.files.atomic import check_output, is_stream, write_atomically
+from piccolo.system.files.line_file import open_locked
+from piccolo.system.jobs.cluster import Cluster
+from piccolo.system.jobs.interruption import Interruption, interruptible
+from piccolo.system.jobs.memory import limit_memory
+from piccolo.system.jobs.threads import Workers
 
 from ..scene import Query, Scene, find_scenes, input_files
 from . import query_result, tables

@@ -11,14 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from piccolo.api.scan import Scan
-from piccolo.arrays import Array
 from piccolo.batch.results_file import check_as_expected
-from piccolo.errors import InputError, printable
-from piccolo.files.json_file import document_of, parse_lines, read_bytes
-from piccolo.files.line_file import whole_size
 from piccolo.geometry.pose import MAX_ANGLE, MAX_DISTANCE, Pose, pose_errors
 from piccolo.judge.probability import LOCALIZED
 from piccolo.judge.result import Result
+from piccolo.system.arrays import Array
+from piccolo.system.errors import InputError, printable
+from piccolo.system.files.json_file import document_of, parse_lines, read_bytes
+from piccolo.system.files.line_file import whole_size
 
 from ..scene import Query, Scene, document_of_pose, pose_of
 

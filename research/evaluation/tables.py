@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from piccolo.apps.export.formats import cell
-from piccolo.arrays import Array
-from piccolo.errors import import_optional, printable
 from piccolo.judge.result import Result
+from piccolo.system.arrays import Array
+from piccolo.system.errors import import_optional, printable
 
 from ..scene import Query, Scene
 from .query_result import PAPER_THRESHOLDS, QueryResult, Thresholds, make_query_result

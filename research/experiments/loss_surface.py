@@ -18,19 +18,19 @@ from scipy.ndimage import minimum_filter
 
 from piccolo import InputError, Pose
 from piccolo.api.result_files import read_results
-from piccolo.arrays import Array, Int64s, Mask
 from piccolo.cli.command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from piccolo.cli.options import add_cloud_options
 from piccolo.cli.settings import cloud_settings_from
-from piccolo.cloud.soa import LocalCloud, PackedPoints
-from piccolo.files.atomic import write_atomically
+from piccolo.geometry.points import LocalCloud, PackedPoints
 from piccolo.geometry.pose import uniform_rotations, uniform_yaws
-from piccolo.jobs.threads import Workers
 from piccolo.optimize.sampling_loss import sampling_loss
-from piccolo.panorama import read_panorama
-from piccolo.panorama.model import shrink
-from piccolo.panorama.texels import Texels, pack_texels
+from piccolo.photo.panorama import read_panorama
+from piccolo.photo.panorama.model import shrink
+from piccolo.photo.panorama.texels import Texels, pack_texels
 from piccolo.scan_map.open_map import open_points
+from piccolo.system.arrays import Array, Int64s, Mask
+from piccolo.system.files.atomic import write_atomically
+from piccolo.system.jobs.threads import Workers
 from piccolo.views.zbuffer import is_free_space, visible_points
 
 from ..evaluation.tables import figure_png, new_figure

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from piccolo import InputError, PaperSettings, Pose
-from piccolo.arrays import Array, Array32, Mask
-from piccolo.cloud.soa import PackedPoints
+from piccolo.geometry.points import PackedPoints
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.optimize.refine import Equations, Loss
-from piccolo.panorama import Panorama
-from piccolo.panorama.model import shrink
+from piccolo.photo.panorama import Panorama
+from piccolo.photo.panorama.model import shrink
+from piccolo.system.arrays import Array, Array32, Mask
 from piccolo.views.zbuffer import MAX_VIEW_WIDTH, MIN_VIEW_WIDTH, View, render_view
 
 MIN_SHOWN_SHARE = 0.5  # of what is rendered, as of the sampling loss: masked pixels may not hide more

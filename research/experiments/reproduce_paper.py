@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 
 from piccolo import CoarseToFineSettings, InputError, PaperSettings, Photo
-from piccolo.arrays import Array, Bytes
 from piccolo.batch.localizer import Localizer
 from piccolo.cli.command import (
     EXIT_BAD_INPUT,
@@ -33,12 +32,13 @@ from piccolo.cli.options import add_execution_options
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
 from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.writers import vertex_rows, writing_ply
-from piccolo.files.atomic import write_atomically
 from piccolo.geometry.colors import Labels
 from piccolo.geometry.pose import Pose, move, rotation_from_quaternion_wxyz, transform_points
-from piccolo.jobs.memory import limit_memory
-from piccolo.panorama import read_panorama
+from piccolo.photo.panorama import read_panorama
 from piccolo.scan_map.open_map import CachePolicy
+from piccolo.system.arrays import Array, Bytes
+from piccolo.system.files.atomic import write_atomically
+from piccolo.system.jobs.memory import limit_memory
 
 from ..evaluation.evaluate import run_scenes
 from ..evaluation.query_result import QueryResult

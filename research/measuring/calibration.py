@@ -10,10 +10,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import chdtri
 
-from piccolo.arguments import MIN_CONFIDENCE
-from piccolo.arrays import Array
 from piccolo.cli.command import Arguments, option
-from piccolo.files.json_file import parse_lines, read_bytes
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import MAX_ANGLE, MAX_DISTANCE
 from piccolo.geometry.pose_gaussian import probability_of_ball, subtract
@@ -22,6 +19,9 @@ from piccolo.judge.belief import make_belief
 from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.judge.probability import AMBIGUOUS, LOCALIZED, ChoiceModel, Standing
 from piccolo.problem.profile import EvidenceKind
+from piccolo.system.arguments import MIN_CONFIDENCE
+from piccolo.system.arrays import Array
+from piccolo.system.files.json_file import parse_lines, read_bytes
 
 from ..evaluation.tables import Table, reliability_table
 from ..scene import pose_of

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from piccolo.arrays import Bytes, Floats, Mask
-from piccolo.camera import Calibration, Camera, Mount
 from piccolo.geometry.pose import Gravity, Pose, yaw_rotation
+from piccolo.photo.camera import Calibration, Camera, Mount
+from piccolo.system.arrays import Bytes, Floats, Mask
 
 from ..synthetic import world as worlds
 

@@ -10,18 +10,18 @@ import cv2
 import numpy as np
 
 from piccolo import CoarseToFineSettings, Photo
-from piccolo.arrays import Bytes, Values
 from piccolo.cli.command import Arguments, option
 from piccolo.cloud.stream import open_cloud, stream_of_arrays
 from piccolo.geometry.pose import Pose
-from piccolo.jobs.threads import Stopwatch, Workers, num_cores
 from piccolo.judge.result import Result
 from piccolo.localization.localize import localize
 from piccolo.localization.means import Means
-from piccolo.panorama import read_panorama
+from piccolo.photo.panorama import read_panorama
 from piccolo.problem.accuracy import PAPER_ACCURACY, Accuracy
 from piccolo.problem.method import METHOD, Method
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
+from piccolo.system.arrays import Bytes, Values
+from piccolo.system.jobs.threads import Stopwatch, Workers, num_cores
 
 from ..scene import Scene, document_of_pose, read_scene
 from ..synthetic import world as worlds

@@ -7,16 +7,16 @@ from typing import NamedTuple
 import numpy as np
 
 from piccolo import CoarseToFineSettings, Photo
-from piccolo.camera.model import camera_of_fov
 from piccolo.cli.command import Arguments, option
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.geometry.pose import Pose
-from piccolo.jobs.threads import Stopwatch, Workers, num_cores
 from piccolo.judge.result import Result
 from piccolo.localization.localize import localize
 from piccolo.localization.means import Means
-from piccolo.panorama import read_panorama
+from piccolo.photo.camera.model import camera_of_fov
+from piccolo.photo.panorama import read_panorama
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
+from piccolo.system.jobs.threads import Stopwatch, Workers, num_cores
 from piccolo.together.group import localize_group
 from piccolo.together.members import Shot
 

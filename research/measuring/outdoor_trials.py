@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from piccolo.jobs.threads import Workers
-from piccolo.panorama.cameras import OF_PIXELS
+from piccolo.photo.panorama.cameras import OF_PIXELS
+from piccolo.system.jobs.threads import Workers
 
 from ..synthetic.outdoor_photos import take_panorama, take_photo
 from ..synthetic.outdoor_scans import SCANNERS, scan_place

@@ -16,13 +16,13 @@ from scipy.special import chdtri
 
 import piccolo
 from piccolo import InputError, PaperSettings, Pose, Result
-from piccolo.arrays import Bytes
 from piccolo.cli.command import Arguments, option
 from piccolo.cloud.stream import open_cloud
-from piccolo.files.atomic import write_atomically
 from piccolo.geometry.pose_gaussian import subtract
-from piccolo.jobs.threads import Workers, num_cores
-from piccolo.panorama import read_panorama
+from piccolo.photo.panorama import read_panorama
+from piccolo.system.arrays import Bytes
+from piccolo.system.files.atomic import write_atomically
+from piccolo.system.jobs.threads import Workers, num_cores
 
 from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import Table, count_rows, reliability_table

@@ -12,11 +12,11 @@ import numpy as np
 from piccolo.cli.command import Arguments, option
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.geometry.nearness import RIGHT
-from piccolo.jobs.threads import Workers, num_cores
 from piccolo.judge.probability import LOCALIZED
 from piccolo.judge.result import Result
 from piccolo.problem.method import METHOD, Method
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
+from piccolo.system.jobs.threads import Workers, num_cores
 
 from ..evaluation.tables import table_of
 from ..scene import read_scene

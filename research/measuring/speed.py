@@ -13,15 +13,15 @@ import cv2
 import numpy as np
 
 import piccolo
-from piccolo.arrays import Array32, Bytes, Floats
-from piccolo.cloud.soa import pack_points
 from piccolo.cloud.stream import Cloud, open_cloud
 from piccolo.geometry.nearness import RIGHT
+from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import Gravity, Pose, yaw_rotation
-from piccolo.jobs.threads import Workers, num_cores
 from piccolo.optimize.sampling_loss import sampling_equations, sampling_loss
-from piccolo.panorama import read_panorama
-from piccolo.panorama.texels import pack_texels
+from piccolo.photo.panorama import read_panorama
+from piccolo.photo.panorama.texels import pack_texels
+from piccolo.system.arrays import Array32, Bytes, Floats
+from piccolo.system.jobs.threads import Workers, num_cores
 
 from ..evaluation.tables import Table
 from ..scene import Query, Scene

@@ -5,12 +5,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from piccolo.arrays import Array, Bytes
-from piccolo.camera import Mount
-from piccolo.camera.model import Camera
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
-from piccolo.jobs.threads import Workers
+from piccolo.photo.camera import Mount
+from piccolo.photo.camera.model import Camera
+from piccolo.system.arrays import Array, Bytes
+from piccolo.system.errors import InputError
+from piccolo.system.jobs.threads import Workers
 
 from .layout import Room
 from .world import change_sensor, free_position, render_picture

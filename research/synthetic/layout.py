@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from piccolo.arrays import Array, Int64s
+from piccolo.system.arrays import Array, Int64s
 
 PLAIN, PLANKS, TILES, STRIPES, CHECKS, PICTURE = range(6)
 WALL_THICKNESS = 0.1  # [m]

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from piccolo.apps.export.formats import tum_lines
-from piccolo.camera import Calibration
-from piccolo.camera.calibration import read_cameras
 from piccolo.cli.command import Arguments, UsageError, check_folder_name, checking_options, command, option
 from piccolo.cloud.writers import vertex_rows, writing_ply
-from piccolo.errors import import_optional
-from piccolo.files.atomic import write_atomically, write_lines
-from piccolo.jobs.threads import Workers
+from piccolo.photo.camera import Calibration
+from piccolo.photo.camera.calibration import read_cameras
+from piccolo.system.errors import import_optional
+from piccolo.system.files.atomic import write_atomically, write_lines
+from piccolo.system.jobs.threads import Workers
 from piccolo.views.pictures import encode_image
 
 from .. import scene as scenes

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from piccolo.arrays import Array, Int64s
-from piccolo.errors import InputError
+from piccolo.system.arrays import Array, Int64s
+from piccolo.system.errors import InputError
 
 from . import layout
 from .layout import PICTURE, PLAIN, PLANKS, TILES, WALL_THICKNESS, Door, Room, RoomBuilder

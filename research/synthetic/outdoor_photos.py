@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from piccolo.arrays import Array
-from piccolo.camera import Camera, Mount
-from piccolo.camera.model import camera_of_fov
 from piccolo.evidence.focal_length import NOT_CALIBRATED
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
-from piccolo.jobs.threads import Workers
+from piccolo.photo.camera import Camera, Mount
+from piccolo.photo.camera.model import camera_of_fov
+from piccolo.system.arrays import Array
+from piccolo.system.jobs.threads import Workers
 
 from . import world as worlds
 from .outdoor_scans import draw_position

@@ -6,12 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from piccolo.arrays import Array, Array32, Bytes
-from piccolo.camera.model import camera_of_fov
-from piccolo.errors import InputError
 from piccolo.geometry.pose import yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.jobs.threads import Workers
+from piccolo.photo.camera.model import camera_of_fov
+from piccolo.system.arrays import Array, Array32, Bytes
+from piccolo.system.errors import InputError
+from piccolo.system.jobs.threads import Workers
 
 from .outdoors import PLACE_KINDS, Place
 from .raycast import cast_rays

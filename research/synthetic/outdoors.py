@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from piccolo.arrays import Array
+from piccolo.system.arrays import Array
 
 from .layout import CHECKS, PICTURE, PLAIN, PLANKS, STRIPES, TILES, Pair, Room, RoomBuilder
 

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from piccolo.arrays import Array, Int64s, Integers
-from piccolo.jobs.threads import Workers
-from piccolo.kernels.jit import inline_kernel, kernel
+from piccolo.system.arrays import Array, Int64s, Integers
+from piccolo.system.jobs.threads import Workers
+from piccolo.system.kernels.jit import inline_kernel, kernel
 
 from .layout import Room, box_distances
 

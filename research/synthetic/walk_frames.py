@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from piccolo import InputError, Pose
-from piccolo.arrays import Bytes
-from piccolo.errors import import_optional
-from piccolo.files.atomic import replacing_by_library
-from piccolo.jobs.threads import Workers
+from piccolo.system.arrays import Bytes
+from piccolo.system.errors import import_optional
+from piccolo.system.files.atomic import replacing_by_library
+from piccolo.system.jobs.threads import Workers
 
 from .layout import CHECKS, PLAIN, STRIPES, Room, RoomBuilder, join_rooms
 from .office import Office

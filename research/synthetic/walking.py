@@ -13,8 +13,8 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from piccolo.arrays import Array, Int32s, Int64s, Mask
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
+from piccolo.system.arrays import Array, Int32s, Int64s, Mask
 
 from .office import FLIGHT_WIDTH, Flight, Office
 

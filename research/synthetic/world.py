@@ -17,15 +17,15 @@ import numpy as np
 import PIL.Image
 from scipy.ndimage import gaussian_filter
 
-from piccolo.arrays import Array, Array32, Bytes, Int64s, Mask, Uint16s, Values
-from piccolo.camera import Calibration, Mount
-from piccolo.camera.calibration import compute_extent
-from piccolo.camera.model import camera_of_fov
-from piccolo.errors import InputError
-from piccolo.files.atomic import write_atomically
 from piccolo.geometry.pose import Pose, exp_so3, uniform_rotations, yaw_rotation
 from piccolo.geometry.sphere import compute_pixels, pixel_rays, solid_angles
-from piccolo.jobs.threads import Workers
+from piccolo.photo.camera import Calibration, Mount
+from piccolo.photo.camera.calibration import compute_extent
+from piccolo.photo.camera.model import camera_of_fov
+from piccolo.system.arrays import Array, Array32, Bytes, Int64s, Mask, Uint16s, Values
+from piccolo.system.errors import InputError
+from piccolo.system.files.atomic import write_atomically
+from piccolo.system.jobs.threads import Workers
 
 from .layout import Room, make_room
 from .raycast import cast_rays

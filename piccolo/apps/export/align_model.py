@@ -6,8 +6,8 @@ import numpy as np
 
 from ...api.result_files import read_results
 from ...cli.command import Arguments, check_distinct, command, option
-from ...files.atomic import check_output, check_output_folder
 from ...geometry.pose import quaternion_wxyz
+from ...system.files.atomic import check_output, check_output_folder
 from .model_alignment import file_of_poses, fit_alignment, write_aligned, write_matrix
 
 EPILOG = """\

@@ -11,9 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ...errors import InputError, import_optional
-from ...files.atomic import library_writing, replacing_folder
 from ...geometry.pose import OPTICAL_FROM_CAM, translation, turn_axes
+from ...system.errors import InputError, import_optional
+from ...system.files.atomic import library_writing, replacing_folder
 from .posed_images import Options, PosedImage, write_offset_beside
 from .scan_points import find_points
 

@@ -8,10 +8,10 @@ from typing import Any
 
 from ...api.result_files import check_scan, read_results
 from ...cli.command import Arguments, check_distinct, checking_options, command, option
-from ...errors import InputError
 from ...geometry.pose import CAMERA_AXES
 from ...judge.result import Result
 from ...scan_map.open_map import CachePolicy, scan_sha256_of
+from ...system.errors import InputError
 from .faces import FACES
 from .formats import FORMATS, export
 from .posed_images import Options, Selection, offset_file, select

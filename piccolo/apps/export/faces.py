@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ...arrays import Bytes
-from ...camera import Camera, Mount
-from ...camera.calibration import rows
-from ...errors import InputError
-from ...files.atomic import write_atomically
-from ...files.json_file import read_bytes
 from ...geometry.pose import R_cam_from_angles
 from ...geometry.sphere import compute_pixels
 from ...localization.result_photo import read_as_localized
-from ...panorama import Panorama
-from ...panorama.picture import WANTED
+from ...photo.camera import Camera, Mount
+from ...photo.camera.calibration import rows
+from ...photo.panorama import Panorama
+from ...photo.panorama.picture import WANTED
+from ...system.arrays import Bytes
+from ...system.errors import InputError
+from ...system.files.atomic import write_atomically
+from ...system.files.json_file import read_bytes
 from ...views.pictures import encode_image, sample_sphere
 from .posed_images import PosedImage, names_within
 

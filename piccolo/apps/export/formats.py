@@ -15,13 +15,20 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ...cloud.settings import check_crs
-from ...errors import InputError, import_optional, printable
-from ...files.atomic import check_output, check_output_folder, replacing_folder, write_atomically, write_lines
-from ...files.json_file import read_bytes
 from ...geometry.pose import CAMERA_AXES, Pose, heading_pitch_roll_deg, quaternion_wxyz, turn_axes
 from ...judge.result import Result
-from ...panorama.gpano import with_pose
-from ...panorama.picture import WANTED
+from ...photo.panorama.gpano import with_pose
+from ...photo.panorama.picture import WANTED
+from ...system.errors import InputError, import_optional, printable
+from ...system.files.atomic import (
+    check_output,
+    check_output_folder,
+    replacing_folder,
+    write_atomically,
+    write_json,
+    write_lines,
+)
+from ...system.files.json_file import read_bytes
 from .colmap import write_colmap
 from .faces import write_faces
 from .posed_images import (
@@ -36,14 +43,7 @@ from .posed_images import (
     select_images,
     write_with_offset,
 )
-from .reconstructions import (
-    NERFSTUDIO_LENSES,
-    OPENSFM_LENSES,
-    check_shape,
-    write_json,
-    write_nerfstudio,
-    write_opensfm,
-)
+from .reconstructions import NERFSTUDIO_LENSES, OPENSFM_LENSES, check_shape, write_nerfstudio, write_opensfm
 from .rerun_file import check_float32, write_rerun
 
 COLUMNS = (

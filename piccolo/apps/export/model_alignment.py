@@ -13,16 +13,16 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ...arrays import Array
 from ...batch.model_poses import transform_of_shot
 from ...batch.relative_poses import read_relative_poses, read_xml
-from ...camera.foreign import is_reconstruction
-from ...errors import InputError, import_optional
-from ...files.atomic import write_atomically, write_lines
-from ...files.json_file import naming, read_json
 from ...geometry.pose import Pose, log_so3
 from ...geometry.pose_gaussian import PoseGaussian, subtract
 from ...judge.result import Result
+from ...photo.camera.foreign import is_reconstruction
+from ...system.arrays import Array
+from ...system.errors import InputError, import_optional
+from ...system.files.atomic import write_atomically, write_json, write_lines
+from ...system.files.json_file import naming, read_json
 from ...together.bundle_adjustment import (
     UNKNOWN_SCALE,
     Bundle,
@@ -35,7 +35,6 @@ from ...together.bundle_adjustment import (
 )
 from ...together.bundle_search import move_origin_near
 from .colmap import read_model, write_model
-from .reconstructions import write_json
 
 LEAST_MODEL_PHOTOS = 3
 MOST_SCALE = 0.1  # chosen: deviation of the logarithm of a scale that is still told

@@ -11,15 +11,15 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ...camera import Calibration, Camera, Mount
-from ...cloud.soa import LocalCloud
-from ...errors import InputError, unreadable
-from ...files.atomic import is_stream, replacing, write_lines
+from ...geometry.points import LocalCloud
 from ...geometry.pose import Pose
 from ...judge.probability import LOCALIZED
 from ...judge.result import Result
-from ...panorama import panorama_size
-from ...panorama.gpano import check_size
+from ...photo.camera import Calibration, Camera, Mount
+from ...photo.panorama import panorama_size
+from ...photo.panorama.gpano import check_size
+from ...system.errors import InputError, unreadable
+from ...system.files.atomic import is_stream, replacing, write_lines
 
 NO_UTF8 = "[\ud800-\udfff]"  # in a name
 # by the lens of a camera model: its name in a format, and the coefficients that it may have

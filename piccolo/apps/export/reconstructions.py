@@ -1,17 +1,16 @@
 """Files of nerfstudio and OpenSfM: cameras with their poses."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from ...camera import Camera
-from ...camera.model import EQUIDISTANT, PERSPECTIVE, SPHERE
 from ...cloud.writers import vertex_rows, writing_ply
-from ...errors import InputError
-from ...files.atomic import write_atomically
 from ...geometry.pose import OPENGL_FROM_CAM, OPTICAL_FROM_CAM, log_so3, translation, turn_axes
+from ...photo.camera import Camera
+from ...photo.camera.model import EQUIDISTANT, PERSPECTIVE, SPHERE
+from ...system.errors import InputError
+from ...system.files.atomic import json_text, write_json
 from .posed_images import Lenses, Options, PosedImage, write_with_offset
 from .scan_points import find_points
 
@@ -116,13 +115,3 @@ def check_shape(image: PosedImage) -> None:
     width, height = image.size
     if image.camera is None and width != 2 * height:
         raise InputError(f"{image.path}: found {width} x {height}, wanted W = 2 H exactly for OpenSfM")
-
-
-def write_json(out: Path, document: object) -> None:
-    """Write a JSON file."""
-    write_atomically(out, json_text(document).encode())
-
-
-def json_text(document: object) -> str:
-    """Return a JSON file's content."""
-    return json.dumps(document, indent=1, allow_nan=False) + "\n"

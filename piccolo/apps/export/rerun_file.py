@@ -12,13 +12,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ...arrays import Bytes
-from ...camera import Camera
-from ...camera.model import PERSPECTIVE, Distortion
-from ...errors import InputError, import_optional
-from ...files.atomic import write_atomically
 from ...geometry.pose import OPTICAL_FROM_CAM, turn_axes
-from ...panorama.picture import read_picture
+from ...photo.camera import Camera
+from ...photo.camera.model import PERSPECTIVE, Distortion
+from ...photo.panorama.picture import read_picture
+from ...system.arrays import Bytes
+from ...system.errors import InputError, import_optional
+from ...system.files.atomic import write_atomically
 from ...views.pictures import encode_image
 from .posed_images import Options, PosedImage
 from .scan_points import find_points

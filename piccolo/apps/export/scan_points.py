@@ -7,16 +7,16 @@ from typing import NamedTuple
 import numpy as np
 from msgspec import convert
 
-from ...arrays import Array, Bytes, Int64s, Mask
 from ...cloud.settings import CloudSettings
-from ...cloud.soa import LocalCloud, pack_points
 from ...cloud.stream import open_cloud
-from ...errors import InputError
 from ...geometry.colors import unpack_rgb
+from ...geometry.points import LocalCloud, pack_points
 from ...geometry.pose import Pose, rotate_points
-from ...jobs.threads import Workers
 from ...judge.result import Result
 from ...scan_map.open_map import find_prepared_map, open_points
+from ...system.arrays import Array, Bytes, Int64s, Mask
+from ...system.errors import InputError
+from ...system.jobs.threads import Workers
 from ...views.zbuffer import VISIBLE_WIDTH, indices_in_front, nearest_depth
 from .posed_images import Options, PosedImage
 

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from ...api.result_files import read_results
-from ...arrays import Array
 from ...batch.inputs import times_of
 from ...batch.pose_table import AHEAD, QUATERNION, PoseTable, read_pose_table
 from ...batch.relative_poses import warn_of_axes
 from ...cli.command import Arguments, UsageError, check_outputs, check_suffix, command, option
-from ...errors import InputError
-from ...files.photo_names import match_names
 from ...geometry.pose import CAMERA_AXES, OPTICAL_FROM_CAM, Pose, angle_between, log_so3, quaternion_wxyz
 from ...judge.result import Result
+from ...system.arrays import Array
+from ...system.errors import InputError
+from ...system.files.photo_names import match_names
 from .mount import Sighting, Trajectory, fit_mount
 
 ALIKE_DEG = 20.0  # chosen: no camera that is mounted otherwise is turned about this axis by 100 to 140 deg

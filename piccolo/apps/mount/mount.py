@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Array
-from ...errors import InputError
+from ...geometry.gauss_newton import Equations, minimize, sum_observations, whiten
 from ...geometry.pose import Pose
 from ...geometry.pose_gaussian import LOOSE, add, subtract
-from ...optimize.gauss_newton import Equations, minimize, sum_observations, whiten
+from ...system.arrays import Array
+from ...system.errors import InputError
 from ...together.bundle_adjustment import (
     RelativeErrors,
     choose_agreed,

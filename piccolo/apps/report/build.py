@@ -13,15 +13,15 @@ import numpy as np
 from ... import __version__
 from ...api.result_files import check_scan
 from ...api.scan import Scan
-from ...arguments import check_fields, check_kind
-from ...errors import InputError
-from ...files.atomic import temporary_folder, write_atomically
-from ...files.cache import digest_of_sources
 from ...geometry.pose import Pose
-from ...jobs.threads import Workers
 from ...judge.result import FAILED, UNREADABLE, Result
-from ...photo import File
+from ...photo.photo import File
 from ...scan_map.scan_map import ScanMap
+from ...system.arguments import check_fields, check_kind
+from ...system.errors import InputError
+from ...system.files.atomic import temporary_folder, write_atomically
+from ...system.files.cache import digest_of_sources
+from ...system.jobs.threads import Workers
 from ...views.pictures import encode_image
 from ...views.surfels import MAX_SURFELS, Surfels, make_surfels
 from . import site
@@ -32,7 +32,7 @@ FORMAT = "piccolo-report/1"
 WIDTH = 2048  # [px] of spheres
 MAX_SELF_CONTAINED = 50  # photos
 CAMERA_HEIGHT = 1.5  # [m] taken of a map in which nothing is level
-MAKERS = ("apps/report", "views", "evidence", "panorama", "camera")  # folders whose sources make the pictures
+MAKERS = ("apps/report", "views", "evidence", "photo")  # folders whose sources make the pictures
 
 
 @dataclass(frozen=True)

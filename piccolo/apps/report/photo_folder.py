@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from ...errors import InputError
 from ...judge.result import Result
 from ...localization.result_photo import photo_of
-from ...panorama.photo import sha256_of
+from ...photo.panorama.facts import sha256_of
+from ...system.errors import InputError
 from .pictures import FRAME
 
 

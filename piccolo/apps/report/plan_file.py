@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from ...arrays import Array
-from ...errors import import_optional
-from ...files.atomic import temporary_folder, write_atomically
 from ...judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
-from ...panorama.picture import read_picture
+from ...photo.panorama.picture import read_picture
 from ...scan_map.scan_map import ScanMap
+from ...system.arrays import Array
+from ...system.errors import import_optional
+from ...system.files.atomic import temporary_folder, write_atomically
 from .build import ReportSettings, Task, check_settings, document_of
 from .site import Entry, begin_folder
 

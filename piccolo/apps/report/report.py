@@ -16,10 +16,10 @@ from ...cli.command import (
 )
 from ...cli.options import CACHE_TEXT, add_cloud_options
 from ...cli.settings import cache_from, cloud_settings_from
-from ...errors import InputError, import_optional
-from ...files.atomic import check_output
-from ...jobs.threads import Stopwatch, num_cores
 from ...scan_map.open_map import open_map
+from ...system.errors import InputError, import_optional
+from ...system.files.atomic import check_output
+from ...system.jobs.threads import Stopwatch, num_cores
 from .build import WIDTH, ReportSettings, build_report
 from .plan_file import DXF, SUFFIXES, write_plan_file
 from .site import check_folder, collect_entries

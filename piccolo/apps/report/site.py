@@ -19,9 +19,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...api.result_files import read_results
-from ...arrays import Array
-from ...errors import printable
-from ...files.atomic import check_output_folder, write_atomically
 from ...geometry.pose import Pose, heading_pitch_roll_deg
 from ...geometry.pose_gaussian import turn_positions
 from ...judge.pose_covariance import PoseCovariance
@@ -30,6 +27,9 @@ from ...judge.reasons import Reason
 from ...judge.result import FAILED, UNREADABLE, Result
 from ...judge.sure import SHOWN
 from ...scan_map.scan_map import ScanMap
+from ...system.arrays import Array
+from ...system.errors import printable
+from ...system.files.atomic import check_output_folder, write_atomically
 
 INDEX = "index.html"
 PAGE_FILES = ("app.js", "app.css")

@@ -22,12 +22,12 @@ from starlette.routing import Route
 
 from ... import __version__
 from ...batch.localizer import Task
-from ...errors import InputError
-from ...jobs.processes import OpeningError, Processes, TooSlowError, WorkerLostError
 from ...judge.result import FAILED, UNREADABLE, Result
-from ...photo import Photo
+from ...photo.photo import Photo
 from ...problem.settings import CoarseToFineSettings
 from ...scan_map.scan_map import ScanMap
+from ...system.errors import InputError
+from ...system.jobs.processes import OpeningError, Processes, TooSlowError, WorkerLostError
 from ..report import site
 from .access import Access
 from .asking import FORM, apply_options, are_together, make_photo, parse_options, read_form

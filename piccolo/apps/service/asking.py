@@ -10,12 +10,12 @@ from typing import Any
 
 from starlette.datastructures import FormData, UploadFile
 
-from ...camera.calibration import calibration_of
-from ...errors import UNPRINTABLE, InputError, printable
-from ...files.json_file import DAMAGE
-from ...photo import Photo, Prior
+from ...photo.camera.calibration import calibration_of
+from ...photo.photo import Photo, Prior
 from ...problem.accuracy import Accuracy
 from ...problem.settings import CoarseToFineSettings
+from ...system.errors import UNPRINTABLE, InputError, printable
+from ...system.files.json_file import DAMAGE
 
 PARTS = ("photo", "prior", "gravity", "accuracy", "min_confidence", "together")
 # options of a photo that name no file

@@ -16,7 +16,7 @@ import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from ...jobs.memory import allow_files
+from ...system.jobs.memory import allow_files
 
 STALL_S = 20.0  # [s] for the headers of a request, and for each step of its body
 BODY_STEP = 1 << 14  # [byte] of a body

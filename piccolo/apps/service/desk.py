@@ -14,14 +14,14 @@ from typing import Any, NamedTuple
 
 from ...api.scan import Scan
 from ...batch.localizer import Localizer, Task
-from ...errors import InputError
-from ...files.atomic import temporary_folder
-from ...jobs.processes import Function, Processes
-from ...jobs.threads import Workers
 from ...judge.result import Result
-from ...panorama.picture import open_picture
+from ...photo.panorama.picture import open_picture
 from ...scan_map.open_map import write_map
 from ...scan_map.scan_map import ScanMap
+from ...system.errors import InputError
+from ...system.files.atomic import temporary_folder
+from ...system.jobs.processes import Function, Processes
+from ...system.jobs.threads import Workers
 from ...views.surfels import MAX_SURFELS, make_surfels
 from ..report import site
 from ..report.build import WIDTH, document_of_scan, list_poses

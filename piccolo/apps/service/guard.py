@@ -16,7 +16,7 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ...api.photo_reader import describe_failure
-from ...errors import ResourceError, printable
+from ...system.errors import ResourceError, printable
 from .access import LOOPBACK, Access
 
 LOG = logging.getLogger(__name__)

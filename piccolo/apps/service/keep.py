@@ -10,10 +10,10 @@ from threading import Lock
 from typing import Any
 
 from ...api.result_files import read_results
-from ...files.atomic import write_atomically
-from ...files.line_file import LineFile, open_locked, whole_size
 from ...judge.result import Result
 from ...scan_map.scan_map import ScanMap
+from ...system.files.atomic import write_atomically
+from ...system.files.line_file import LineFile, open_locked, whole_size
 from ..report import site
 
 RESULTS = "results.jsonl"

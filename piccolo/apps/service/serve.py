@@ -14,11 +14,11 @@ from urllib.parse import urlsplit
 from ...cli.command import Arguments, UsageError, checking_options, command, option
 from ...cli.options import CACHE_TEXT, add_cloud_options, add_method_options
 from ...cli.settings import localizer_from
-from ...errors import InputError, import_optional, printable
-from ...files.atomic import temporary_folder
-from ...files.json_file import read_text
-from ...jobs.memory import GB, memory_taken
-from ...jobs.threads import num_cores
+from ...system.errors import InputError, import_optional, printable
+from ...system.files.atomic import temporary_folder
+from ...system.files.json_file import read_text
+from ...system.jobs.memory import GB, memory_taken
+from ...system.jobs.threads import num_cores
 from .access import LOOPBACK, Access
 from .desk import Limits, open_desk
 from .keep import open_keep

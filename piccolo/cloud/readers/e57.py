@@ -12,9 +12,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ...arrays import Array, Bytes
-from ...errors import InputError
 from ...geometry.pose import Pose, rotate_points
+from ...system.arrays import Array, Bytes
+from ...system.errors import InputError
 from ..settings import BY_FILE, RANGES, Channel, CloudSettings
 from ..units import describe_foreign, units_of_wkt
 from . import e57_file, reader

@@ -16,9 +16,9 @@ from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
 
 import numpy as np
 
-from ...arrays import Array
-from ...errors import InputError, import_optional
 from ...geometry.pose import Pose, rotation_from_quaternion_wxyz
+from ...system.arrays import Array
+from ...system.errors import InputError, import_optional
 from .reader import quote_line
 
 MAGIC = b"ASTM-E57"

@@ -15,8 +15,8 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Bytes
-from ...errors import InputError, import_optional
+from ...system.arrays import Bytes
+from ...system.errors import InputError, import_optional
 from ..settings import BY_FILE, Channel, CloudSettings
 from . import reader
 from .las_file import WANTED, LasHeader, find_units, read_header, record_content

@@ -6,8 +6,8 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from ...arrays import Array
-from ...errors import InputError
+from ...system.arrays import Array
+from ...system.errors import InputError
 from ..units import (
     DOUBLES_ID,
     GEOGRAPHIC_KEY,

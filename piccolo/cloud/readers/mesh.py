@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...arrays import Array, Bytes, Int64s, Mask
-from ...errors import InputError
 from ...geometry.colors import srgb_to_linear, to_bytes
 from ...geometry.pose import transform_points
+from ...system.arrays import Array, Bytes, Int64s, Mask
+from ...system.errors import InputError
 from ..settings import BY_FILE, Channel, CloudSettings, UpAxis
 from .mesh_files import GLB_MAGIC, Texture
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply

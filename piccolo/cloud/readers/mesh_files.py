@@ -19,8 +19,8 @@ from urllib.parse import unquote
 import numpy as np
 from PIL import Image
 
-from ...arrays import Bytes
-from ...errors import InputError
+from ...system.arrays import Bytes
+from ...system.errors import InputError
 
 # of a map in a material library, before the name of its file
 MAP_OPTIONS = re.compile(r"^(?:-\w+(?:\s+(?:-?[\d.]+|on|off|[a-z]))*\s+)+", re.IGNORECASE)

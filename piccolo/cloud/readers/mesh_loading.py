@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import Array
-from ...errors import InputError, import_optional
+from ...system.arrays import Array
+from ...system.errors import InputError, import_optional
 from ..settings import BY_FILE, CloudSettings
 from . import mesh_files
 from .mesh_files import GLB_MAGIC, NO_MATERIAL, FolderResolver, Material, Texture

@@ -15,8 +15,8 @@ from typing import IO, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError
-from ...files.array_archive import MAX_HEAD_SIZE, read_header
+from ...system.errors import InputError
+from ...system.files.array_archive import MAX_HEAD_SIZE, read_header
 from ..settings import BY_FILE, Channel, CloudSettings
 from . import reader
 from .reader import MissingChannelError, PointSource, quote_line

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...errors import InputError, import_optional
+from ...system.errors import InputError, import_optional
 from ..settings import BY_FILE, Channel, CloudSettings
 from . import reader
 from .reader import MissingChannelError, PointSource, quote_line

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
-from ...errors import InputError
+from ...system.errors import InputError
 from ..settings import BY_FILE, Channel, CloudSettings
 from . import reader
 from .mesh import open_ply_mesh

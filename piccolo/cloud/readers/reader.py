@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Array, Bytes, Floats, Mask
-from ...errors import InputError
 from ...geometry.colors import Labels, label_colors
+from ...system.arrays import Array, Bytes, Floats, Mask
+from ...system.errors import InputError
 from ..settings import BY_FILE, RANGES, Channel, CloudSettings, UpAxis
 
 HEAD_SIZE = 512  # [byte] from which a format is known

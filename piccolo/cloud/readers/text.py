@@ -16,13 +16,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Array
-from ...errors import InputError
 from ...geometry.pose import transform_points
+from ...system.arrays import Array
+from ...system.errors import InputError
+from ...system.files.json_file import is_number
 from ..settings import BY_FILE, Channel, CloudSettings
 from . import reader, text_columns
 from .reader import MissingChannelError, PointSource, find_brightest, quote_line
-from .text_columns import COMMENT_MARKS, Spelling, is_number, split, text_blocks
+from .text_columns import COMMENT_MARKS, Spelling, split, text_blocks
 
 BYTES_AT_ONCE = 1 << 20  # [byte] read at once; no line is longer
 NUM_WITH_INTENSITY = 4  # columns of a line without colours: x y z intensity

@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Array
-from ...errors import InputError
+from ...system.arrays import Array
+from ...system.errors import InputError
+from ...system.files.json_file import is_number
 from ..settings import COLUMNS, CloudSettings
 from .reader import COLOR_NAMES, CUT, NUM_COLORED, POINT_NAMES
 
@@ -118,15 +119,6 @@ def read_fields(path: Path, wanted: str) -> Fields:
             header = line.decode("latin-1").strip()
         start += len(line)
     raise InputError(f"{path}: no line of numbers at its beginning, {wanted}")
-
-
-def is_number(field: str) -> bool:
-    """Return True if np.loadtxt reads a field as a number."""
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return "_" not in field  # which Python takes and np.loadtxt does not
 
 
 def _has_decimal_commas(text: str, delimiter: str | None) -> bool:

@@ -11,24 +11,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Array, Array32, Bytes, Int32s
 from ...cloud.octree import Octree, recolor
 from ...cloud.settings import CloudSettings
 from ...cloud.stream import open_cloud
 from ...cloud.writers import SUFFIXES, describe_unit, write_colored
-from ...errors import InputError
-from ...files.line_file import Journal
 from ...geometry.pose import Pose
 from ...geometry.pose_gaussian import turn_positions
-from ...jobs.memory import check_memory
-from ...jobs.threads import Workers
 from ...judge.result import FAILED, Result
-from ...kernels.jit import F0, HALF, kernel
 from ...localization.result_photo import read_as_localized
-from ...panorama import Panorama, texels
-from ...panorama.model import shrink
+from ...photo.panorama import Panorama, texels
+from ...photo.panorama.model import shrink
 from ...scan_map.open_map import find_prepared_map
 from ...scan_map.scan_map import SHAPE_ALONE, ScanMap, change_colors
+from ...system.arrays import Array, Array32, Bytes, Int32s
+from ...system.errors import InputError
+from ...system.files.line_file import Journal
+from ...system.jobs.memory import check_memory
+from ...system.jobs.threads import Workers
+from ...system.kernels.jit import F0, HALF, kernel
 from .alignment import Anchor, Sight, align, look, weigh_points
 from .passersby import remove_passersby
 

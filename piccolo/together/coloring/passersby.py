@@ -12,13 +12,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ...arrays import Array32, Bytes, Int64s, Mask
 from ...cloud.octree import Octree
 from ...geometry.pose import Pose
 from ...geometry.sphere import compute_indices
-from ...jobs.threads import Workers
-from ...kernels.jit import F0, HALF, kernel
-from ...panorama import Panorama, texels
+from ...photo.panorama import Panorama, texels
+from ...system.arrays import Array32, Bytes, Int64s, Mask
+from ...system.jobs.threads import Workers
+from ...system.kernels.jit import F0, HALF, kernel
 from .alignment import MOST_SEEN, POINTS_PER_PHOTO, Sightings, find_sightings, read_all
 
 VOTE_WIDTH = 256  # [px] of the cells in which votes are counted: 1.4 degrees each

@@ -12,7 +12,6 @@ from ...evidence.verification import draw_near, verify
 from ...geometry.nearness import ONE_ANSWER, RIGHT
 from ...geometry.pose import Pose
 from ...geometry.pose_gaussian import PoseGaussian, probability_near
-from ...jobs.threads import Workers
 from ...judge.by_others import LOCAL_ERRORS, local_share
 from ...judge.candidate import Selection
 from ...judge.probability import posterior
@@ -23,6 +22,7 @@ from ...localization.beam import descend_briefly, score_mirror, score_near
 from ...localization.means import Means
 from ...localization.near import Near, refine_near
 from ...problem.problem import Problem
+from ...system.jobs.threads import Workers
 from ..beside import attach_by_matches, confirm, fuse_allowed
 from .expectation import Expected, Followed, describe_end, is_acceptable, list_alike, list_starts
 from .frames import MOST_EXPECTED, State, log_ratio, put_state

@@ -13,9 +13,6 @@ from typing import Literal
 
 import numpy as np
 
-from ...arguments import MAX_SPEED, MAX_STEP, check_fields
-from ...arrays import Array
-from ...errors import InputError
 from ...geometry.nearness import ONE_ANSWER
 from ...geometry.pose import Pose
 from ...geometry.pose_gaussian import PoseGaussian
@@ -25,6 +22,9 @@ from ...judge.result import Result
 from ...judge.sure import SURE_ODDS
 from ...scan_map.camera_positions import COARSE_SPACING
 from ...scan_map.scan_map import ScanMap
+from ...system.arguments import MAX_SPEED, MAX_STEP, check_fields
+from ...system.arrays import Array
+from ...system.errors import InputError
 
 How = Literal["alone", "near", "tracked", "none"]
 MOST_EXPECTED = 3.0  # [log] that a frame gains at most by being where it was to be expected

@@ -16,12 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Array, Mask
 from ...geometry.nearness import ONE_ANSWER
 from ...geometry.pose import Pose, carry
 from ...judge.result_parts import Gap
 from ...problem.accuracy import Accuracy, Demand
 from ...scan_map.camera_positions import FreeSpace
+from ...system.arrays import Array, Mask
 from .frames import JUMP_LOG, MOST_EXPECTED, MOST_ODDS, REACH_SLACK, Frame, Motion, State, state_centers
 
 EVEN = 0.5  # less is not sure

@@ -8,10 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import Array
 from ...evidence.contradictions import contradictions
 from ...geometry.pose_gaussian import PoseGaussian, add
-from ...jobs.threads import Progress, no_progress
 from ...judge.alternatives import MAX_ALTERNATIVES
 from ...judge.belief import make_belief
 from ...judge.conclude import take_pose
@@ -21,6 +19,8 @@ from ...judge.probability import LOCALIZED
 from ...judge.reasons import explain
 from ...judge.result import Result, nothing_found
 from ...judge.result_parts import Alone, Alternative, Gap, WalkFrame
+from ...system.arrays import Array
+from ...system.jobs.threads import Progress, no_progress
 from .frames import Frame
 from .path import EVEN, Ranked
 from .second_look import finish

@@ -11,11 +11,11 @@ from itertools import groupby, islice
 
 import numpy as np
 
-from ...arguments import MIN_CONFIDENCE
 from ...geometry.pose import Pose, carry
-from ...jobs.threads import Progress, one_blas_thread
 from ...problem.accuracy import Demand
 from ...problem.problem import Problem
+from ...system.arguments import MIN_CONFIDENCE
+from ...system.jobs.threads import Progress, one_blas_thread
 from .expectation import Expected, Followed
 from .following import find_near, refine_state
 from .frames import Frame

@@ -9,17 +9,17 @@ from ...evidence.verification import match_beside, place_keypoints
 from ...geometry.nearness import ONE_PLACE, RIGHT
 from ...geometry.pose import Pose
 from ...geometry.pose_gaussian import PoseGaussian
-from ...jobs.threads import Stopwatch, Workers, one_blas_thread
 from ...localization.attempts import can_look_first
 from ...localization.localize import localize
 from ...localization.means import Means
-from ...panorama import Panorama
+from ...photo.panorama import Panorama
 from ...problem.cone import find_cone
 from ...problem.prior import apply_prior
 from ...problem.problem import Problem, prepare_problem
 from ...problem.settings import CoarseToFineSettings
 from ...scan_map.camera_positions import FreeSpace
 from ...scan_map.scan_map import ScanMap
+from ...system.jobs.threads import Stopwatch, Workers, one_blas_thread
 from .expectation import Followed, expect
 from .following import Told, find_near, refine_state
 from .frames import REACH_SLACK, Frame, Motion, list_states, put_state

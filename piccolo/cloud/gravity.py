@@ -1,0 +1,242 @@
+"""The vertical and the walls of a scan by its planes, and which end of the vertical is up by evidence.
+
+Planes are found by RANSAC. The evidence is what people do over floors and not below ceilings: seats, tables
+and shelves are above floors as high as people reach, and people walk from room to room over floors, while
+lintels, beams and walls divide the space below ceilings. Each cue is the logarithm of a ratio.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..system.arrays import Array, Array32, Int64s, Mask
+from .octree import Octree
+
+# Chosen by hand; the noise of scanners (2 to 5 mm) is far below the spacing of the points
+POINT_SPACING = 0.08  # of the points that are used [m]
+MAX_NORMALS = 40_000  # that get a normal: a plane of 1 % of the cloud still has 400
+NUM_PLANE_NEIGHBORS = 24  # with the point itself: at 8 cm a disc of radius 0.22 m
+MIN_FRACTION = 0.01  # of all points, of a dominant plane
+NUM_HYPOTHESES = 200  # for each plane: one lies on a plane of 2 % of the points in 98 % of draws
+PLANE_TOLERANCE = 0.03  # of an inlier, from the plane: six times a scanner's noise of 5 mm [m]
+INLIER_ANGLE = np.radians(15.0)  # of its normal, loose since normals near edges lean
+MAX_LEAN = np.radians(15.0)  # of the vertical to a direction that is said to be up
+AGREE_ANGLE = np.radians(3.0)  # of a plane to level or upright, that counts for the vertical
+MIN_ALIGNED = 0.6  # fraction of the planes' area that is level or upright: roofs are neither
+LEVEL_ANGLE = np.radians(8.0)  # of a level surface's normal to the vertical: ramps up to 1 : 7 are floors
+PERSON_HEIGHT = 1.9  # of a person [m]
+FURNITURE = 0.3, 1.2  # heights of seats, tables, counters, shelves above the floor [m]
+WALKABLE_STEP = 0.3  # what is lower does not keep anybody from walking [m]
+WALKING_CELL = 0.25  # of the grid in which people walk [m], or larger in wide scans
+FLOOR_REACH = 2  # cells between the points of a floor, or between free space and the next thing over a floor
+ADDED_CELLS = 20.0  # added to both counts of a ratio, so that a handful says little
+
+
+class PointNormals(NamedTuple):
+    """A sample of a cloud with the normals there."""
+
+    points: Array  # (M, 3) [m]
+    normals: Array  # (M, 3) unit, of either sign
+    is_flat: Mask  # (M,) the neighbourhood is a plane
+
+
+class Planes(NamedTuple):
+    """Dominant planes, the largest first."""
+
+    normals: Array  # (P, 3) unit, of either sign
+    centers: Array  # (P, 3) mean of the inliers [m]
+    areas: Array  # (P,) fraction of all points of the sample, which are spread evenly in space
+
+
+def dot(vectors: Array, axis: Array) -> Array:
+    """Return dot products (M,) of vectors (M, 3) and an axis (3,); by BLAS they would depend on threads."""
+    return np.asarray(np.einsum("ni,i->n", vectors, axis))
+
+
+def estimate_normals(points: Array32) -> PointNormals:
+    """Return normals of an evenly strided sample of a cloud (N, 3) [m], by PCA of the nearest points."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who asks for up waits for it
+
+    sample = points[:: -(-len(points) // MAX_NORMALS)].astype(np.float64)
+    nearest = list(range(1, min(NUM_PLANE_NEIGHBORS, len(points)) + 1))
+    neighbors = points[cKDTree(points).query(sample, nearest)[1]].astype(np.float64)
+    neighbors -= neighbors.mean(axis=1, keepdims=True)
+    variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", neighbors, neighbors))
+    across, narrow, wide = variances.T
+    is_flat = (across < 0.05 * narrow) & (narrow > 0.1 * wide)  # thin, and no line
+    return PointNormals(sample, axes[:, :, 0], is_flat)
+
+
+def ransac_planes(cloud: PointNormals) -> Planes:
+    """Return the dominant planes: RANSAC on flat points, least squares on all inliers."""
+    rng = np.random.default_rng(20)
+    left = np.flatnonzero(cloud.is_flat)
+    found: list[tuple[Array, Array, float]] = []
+    least = max(MIN_FRACTION * len(cloud.points), 3)
+    while len(found) < 24 and len(left) > least:
+        drawn = rng.choice(left, NUM_HYPOTHESES)
+        scoring = rng.choice(left, 2000)  # a plane of 1 % has 20 of them
+        votes = _are_inliers(cloud, scoring, cloud.normals[drawn], cloud.points[drawn]).sum(axis=1)
+        normal = cloud.normals[drawn[votes.argmax()]]
+        center = cloud.points[drawn[votes.argmax()]]
+        for _ in range(4):  # refits, until the inliers stay the same
+            is_inlier = _are_inliers(cloud, left, normal[None], center[None])[0]
+            inliers = cloud.points[left[is_inlier]]
+            if len(inliers) < least:
+                break
+            center = inliers.mean(axis=0)
+            normal = np.linalg.eigh(np.einsum("ni,nj->ij", inliers - center, inliers - center))[1][:, 0]
+        if len(inliers) < least:
+            break
+        found.append((normal, center, len(inliers) / len(cloud.points)))
+        left = left[~is_inlier]
+    found.sort(key=lambda plane: -plane[2])
+    normals, centers, areas = zip(*found, strict=True) if found else ((), (), ())
+    return Planes(np.reshape(normals, (-1, 3)), np.reshape(centers, (-1, 3)), np.array(areas))
+
+
+def _are_inliers(cloud: PointNormals, some: Int64s, normals: Array, points: Array) -> Mask:
+    """Return which of some points (S,) lie on planes (H, S) by normals and points (H, 3)."""
+    offsets = np.einsum("hi,hi->h", normals, points)[:, None]
+    distances = np.einsum("hi,ji->hj", normals, cloud.points[some]) - offsets
+    cosines = np.einsum("hi,ji->hj", normals, cloud.normals[some])
+    return np.asarray((np.abs(distances) < PLANE_TOLERANCE) & (np.abs(cosines) > np.cos(INLIER_ANGLE)))
+
+
+def find_up(octree: Octree) -> tuple[Array, float, str, Planes]:
+    """Return a scan's vertical (3,), the sign of up along it or 0 if that is not plain, why, and the planes.
+
+    The vertical is square to the largest area, and along it the scan is lower than it is wide.
+    """
+    cloud = estimate_normals(octree.level(POINT_SPACING)[:, :3])
+    planes = ransac_planes(cloud)
+    if not len(planes.areas):
+        return np.array([0.0, 0.0, 1.0]), 0.0, "there are no dominant planes", planes
+    level_areas, aligned_areas = _areas_by(planes)
+    largest = int(level_areas.argmax())
+    axis = _refine(planes, planes.normals[largest])
+    heights = dot(cloud.points, axis)
+    places = np.einsum("ni,ji->nj", cloud.points, np.linalg.svd(axis[None])[2][1:])
+    across = places @ np.linalg.eigh(np.cov(places.T))[1][:, 0]
+    height, width = (np.ptp(np.quantile(x, [0.01, 0.99])) for x in (heights, across))
+    if aligned_areas[largest] < MIN_ALIGNED:
+        return axis, 0.0, "too many planes are neither horizontal nor vertical", planes
+    if height > 0.75 * width:
+        return axis, 0.0, f"{height:.1f} m high and {width:.1f} m wide, a wall may be the floor", planes
+    return axis, *find_sense(cloud, find_levels(planes, axis), axis, heights, places), planes
+
+
+def level(planes: Planes, said: Array) -> Array:
+    """Return the vertical (3,) near a direction that is said to be up; that itself if none is, or it fits."""
+    is_near = np.abs(dot(planes.normals, said)) > np.cos(MAX_LEAN)
+    is_vertical = is_near & (_areas_by(planes)[1] > MIN_ALIGNED)
+    if not is_vertical.any():
+        return said
+    axis = _refine(planes, planes.normals[is_vertical.argmax()])
+    cosine = float(axis @ said)
+    return said if abs(cosine) > np.cos(np.radians(0.2)) else axis * np.sign(cosine)
+
+
+def _areas_by(planes: Planes) -> tuple[Array, Array]:
+    """Return what fraction of the planes' area is level, and level or upright, by the normal of each (P,)."""
+    cosines = np.abs(planes.normals @ planes.normals.T)
+    areas = planes.areas / planes.areas.sum()
+    is_level = cosines > np.cos(LEVEL_ANGLE)
+    return is_level @ areas, (is_level | (cosines < np.sin(LEVEL_ANGLE))) @ areas
+
+
+def _refine(planes: Planes, axis: Array) -> Array:
+    """Return the vertical (3,) by least squares on the planes that are nearly level or upright."""
+    cosines = np.abs(dot(planes.normals, axis))
+    signs = 1.0 * (cosines < np.sin(AGREE_ANGLE)) - (cosines > np.cos(AGREE_ANGLE))
+    spread = np.einsum("n,ni,nj->ij", signs * planes.areas, planes.normals, planes.normals)
+    return np.asarray(np.linalg.eigh(spread)[1][:, 0])
+
+
+def wall_yaw(planes: Planes, R_level_from_scan: Array) -> float | None:
+    """Return the smallest turn about z [rad], in (-45, 45] deg, that puts dominant walls along x and y."""
+    x, y, z = R_level_from_scan @ planes.normals.T
+    is_wall = np.abs(z) < np.sin(LEVEL_ANGLE)
+    if not is_wall.any():
+        return None
+    k = (is_wall * _areas_by(planes)[1]).argmax()  # a wall to which most others are parallel or square
+    turns = -np.arctan2(y[k], x[k]) / (0.5 * np.pi)
+    return float(turns - np.ceil(turns - 0.5)) * 0.5 * np.pi
+
+
+def find_yaw_of_walls(octree: Octree) -> float | None:
+    """Return `wall_yaw` of the octree of a cloud whose z is up."""
+    return wall_yaw(ransac_planes(estimate_normals(octree.level(POINT_SPACING)[:, :3])), np.eye(3))
+
+
+def find_sense(
+    cloud: PointNormals, levels: Array, axis: Array, heights: Array, places: Array
+) -> tuple[float, str]:
+    """Return 1 if up is along a vertical (3,), -1 if against it, 0 if that is not plain; and why.
+
+    By levels (L,) of floors and ceilings, the points' heights (M,) and places (M, 2) in the plan.
+    """
+    if len(levels) < 2:
+        return 0.0, "a floor and a ceiling are not both among the dominant planes"
+    is_level = cloud.is_flat & (np.abs(dot(cloud.normals, axis)) > np.cos(LEVEL_ANGLE))
+    passages = passage_cue(heights, is_level, levels, places)
+    cues = np.array([furniture_cue(heights, is_level, levels), passages])
+    sense = float(np.sign(cues.sum()))
+    # the least lesser cue: in high storeys, whose trusses look like tables, both cues must agree
+    least = 0.3 if np.diff(levels).max() > 4.0 else -0.5
+    is_plain = sense * cues.sum() > 1.0 and (sense * cues).min() > least
+    reason = "furniture {:+.1f}, free space {:+.1f}".format(*sense * cues)
+    return (sense, reason) if is_plain else (0.0, f"floor and ceiling look alike: {reason}")
+
+
+def find_levels(planes: Planes, axis: Array) -> Array:
+    """Return the heights (L,) of floors and ceilings along a vertical (3,), ascending, a person apart."""
+    is_level = np.abs(dot(planes.normals, axis)) > np.cos(LEVEL_ANGLE)
+    levels: list[float] = []
+    for height, area in zip(dot(planes.centers, axis)[is_level], planes.areas[is_level], strict=True):
+        is_large = area > 0.3 * planes.areas[is_level][0]  # tables have less
+        if is_large and all(abs(height - other) > PERSON_HEIGHT for other in levels):
+            levels.append(float(height))
+    return np.array(sorted(levels))
+
+
+def furniture_cue(heights: Array, is_level: Mask, levels: Array) -> float:
+    """Compare level faces as high as furniture above levels (L,) with those as far below."""
+    next_level = np.searchsorted(levels, heights[is_level])
+    above = heights[is_level] - np.append(-np.inf, levels)[next_level]
+    below = np.append(levels, np.inf)[next_level] - heights[is_level]
+    low, high = FURNITURE
+    few = 0.001 * len(heights)  # as ADDED_CELLS
+    standing = np.count_nonzero((above > low) & (above < np.minimum(high, below)))
+    hanging = np.count_nonzero((below > low) & (below < np.minimum(high, above)))
+    return float(np.log((standing + few) / (hanging + few)))
+
+
+def passage_cue(heights: Array, is_level: Mask, levels: Array, places: Array) -> float:
+    """Compare how far space that is free for a person is in one piece above levels (L,) and below them.
+
+    That is the mean, over the free area of a level, of the fraction that the piece has of the level's.
+    """
+    from scipy import ndimage  # noqa: PLC0415  # only who asks for up waits for it
+
+    low, high = np.quantile(places, [0.001, 0.999], axis=0)
+    cell = max(WALKING_CELL, float(np.sqrt(np.prod(high - low) / 4e6)))
+    edges = [np.arange(a, b + cell, cell) for a, b in zip(low, high, strict=True)]
+
+    def grid(mask: Mask) -> Mask:
+        return np.asarray(np.histogramdd(places[mask], edges)[0] > 0)
+
+    pieces = np.full((2, 2), ADDED_CELLS)  # above, below: free cells times their piece's fraction; free cells
+    for level in levels:
+        sheet = np.pad(grid(is_level & (np.abs(heights - level) < 0.12)), FLOOR_REACH)
+        sheet = ndimage.binary_closing(sheet, iterations=FLOOR_REACH)[
+            FLOOR_REACH:-FLOOR_REACH, FLOOR_REACH:-FLOOR_REACH
+        ]
+        for k, off in enumerate((heights - level, level - heights)):
+            is_free = sheet & ~grid((off > WALKABLE_STEP) & (off < PERSON_HEIGHT))
+            is_free &= ndimage.binary_dilation(grid(off > WALKABLE_STEP), iterations=FLOOR_REACH)
+            areas = np.bincount(ndimage.label(is_free)[0].ravel())[1:]
+            areas = areas[areas > 8]  # cells of one piece
+            pieces[k] += (areas**2).sum() / max(areas.sum(), 1), areas.sum()
+    above, below = pieces[:, 0] / pieces[:, 1]
+    return float(np.log(above / below))

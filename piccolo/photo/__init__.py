@@ -1,0 +1,1 @@
+"""A photo, what its file says, and the camera that took it."""

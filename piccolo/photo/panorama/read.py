@@ -1,0 +1,291 @@
+"""A picture file or a folder of cube faces, read as a panorama: a full sphere, and the pixels that count."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ...geometry.colors import Labels
+from ...system.arrays import Bytes, Mask
+from ...system.errors import InputError
+from ...system.jobs.memory import check_memory
+from ..camera import Calibration, Mount
+from ..camera.calibration import MAX_OFFSET
+from ..camera.resampling import View, make_sphere, sphere_width
+from ..photo import File, Photo, as_photo
+from . import gpano
+from .cameras import Cameras, cameras_of, read_views, rig_cameras
+from .cube import cube_of_cells, face_paths, read_cube_folder
+from .facts import elevation_deg
+from .gpano import ASPECT_TOLERANCE, CropRegion
+from .masks import black_borders, find_mask, is_dual_fisheye, mask_pole, polar_disc, read_mask, shows_twice
+from .model import FocalPrior, GPano, Panorama
+from .picture import PICTURE_BYTES_PER_PIXEL, Picture, picture_shape, read_labels, read_picture
+
+Shot = tuple[Path, Picture, tuple[Mount, ...]]  # a file with the cameras that took it
+PHOTO_FOV_DEG = 65, 50  # of a phone's main camera, 24 to 28 mm on film: 63 to 72 wide, upright 50 to 57
+CHOICES = (
+    "If a camera took it, give `focal_px` or `camera`; if its focal length is unknown, `projection` pinhole "
+    "`fov_deg` {} `refine_focal`. If it is a part of a panorama, give `fov_deg`. If it is a cube, give "
+    "a folder of its six faces (in Python also `cube_order`)"
+)
+CAMERA_RATIOS = 4 / 3, 3 / 2, 16 / 9
+LIKE_A_PHOTO = (
+    "read as a part of a panorama, though it has the shape of a camera's photo: for a photo add `projection` "
+    "pinhole, for a part of a panorama `projection` equirectangular"
+)
+NO_HORIZON = "the metadata call the crop's height the sphere's: its horizon is assumed to be in the middle"
+MIN_REPORTED_SHARE = 0.001  # of the sphere: borders below this are masked without a warning
+
+
+def read_panorama(photo: File | Bytes | Photo, labels: Labels | None = None) -> Panorama:
+    """Return the full sphere of a picture file, a folder of six cube faces or an array.
+
+    Colours have 8 bits (of 16 the upper 8, v >> 8), grey becomes RGB, EXIF's orientation is applied. Not
+    valid are pixels of alpha 0, outside a crop, masked, in black borders and in discs over a pole. Labels
+    become colours, and only masks and ignored labels are not valid. Of an array only masked pixels are not.
+
+    InputError if the file is missing or damaged, of another format or projection, its size is out of range,
+    or the part of the sphere that it shows is unknown.
+    """
+    photo = as_photo(photo)
+    panorama = _read(photo, labels)
+    if photo.gravity_vector is None:
+        return panorama
+    return replace(panorama, gpano=gpano.attitude_of_gravity(photo.gravity_vector))
+
+
+def check_labels(photo: Photo, labels: Labels | None) -> None:
+    """Refuse a photo that does not show the full sphere where labels are compared."""
+    if labels and (ways := photo.list_ways()):
+        raise InputError(f"`labels`: found {ways[0]} too, wanted a picture of the full sphere")
+
+
+def _read(photo: Photo, labels: Labels | None) -> Panorama:
+    """Read a photo; its attitude is that of the file."""
+    check_labels(photo, labels)
+    if isinstance(photo.picture, np.ndarray):
+        return _read_array(photo, photo.picture)
+    if labels:
+        return _read_labelled(photo, labels)
+    if photo.instant is not None:
+        return _read_rig(photo, photo.instant)
+    if photo.path.is_dir():
+        return _embed_and_mask(photo, read_cube_folder(photo.path), CropRegion(), None)
+    return _read_picture(photo)
+
+
+def _read_picture(photo: Photo) -> Panorama:
+    """Read the photo in one file."""
+    path = photo.path
+    picture = read_picture(path)
+    if photo.projection == "cylindrical" and photo.fov_deg is not None:
+        picture = _unroll(picture, math.radians(photo.fov_deg))
+    if cube := cube_of_cells(path, picture, photo.cube_order):
+        return _embed_and_mask(photo, cube, CropRegion(), None)
+    fields = gpano.gpano_fields(picture.xmp)
+    cameras = cameras_of(photo, picture, bool(fields))
+    attitude = gpano.attitude(fields) if fields else None
+    picture = replace(picture, warnings=(*picture.warnings, *cameras.notes))
+    if cameras.mounts:
+        if attitude is None and (elevation := elevation_deg(picture.exif)) is not None:
+            attitude = GPano(elevation)
+        return _on_sphere(photo, [(path, picture, cameras.mounts)], attitude, cameras)
+    region, more = _region_of(photo, picture, fields)
+    picture = replace(picture, warnings=(*picture.warnings, *more))
+    return _embed_and_mask(photo, picture, region, attitude)
+
+
+def _read_array(photo: Photo, rgb: Bytes) -> Panorama:
+    """Return the panorama of an image (H, W, 3), of the photo's camera or a full sphere."""
+    rgb = np.ascontiguousarray(rgb)
+    is_valid = ~photo.mask if isinstance(photo.mask, np.ndarray) else np.ones(rgb.shape[:2], np.bool_)
+    picture = Picture(rgb, is_valid)
+    cameras = cameras_of(photo, picture, has_gpano=True)
+    if cameras.mounts:
+        return _on_sphere(photo, [(photo.path, picture, cameras.mounts)], None, cameras)
+    if rgb.shape[1] != 2 * len(rgb):
+        found = f"{rgb.dtype} of shape {rgb.shape}"
+        raise InputError(f"`picture`: found {found}, wanted RGB in uint8 of shape (H, 2 H, 3), or a camera")
+    return Panorama(rgb, is_valid)
+
+
+def _read_rig(photo: Photo, rig: Calibration) -> Panorama:
+    """Return the panorama of the pictures of one instant."""
+    folder = photo.path
+    files = rig.images_in(folder)
+    pictures = [read_picture(file) for file in files]
+    shots = list(zip(files, pictures, rig_cameras(folder, pictures, rig), strict=True))
+    panorama = _on_sphere(photo, shots, None)
+    if rig.extent <= MAX_OFFSET:
+        return panorama
+    note = f"the rig's cameras are up to {rig.extent:.2f} m from its origin: near objects appear displaced"
+    return replace(panorama, warnings=(*panorama.warnings, note))
+
+
+def _on_sphere(
+    photo: Photo, shots: list[Shot], attitude: GPano | None, of_one: Cameras | None = None
+) -> Panorama:
+    """Project the pictures of one instant, each with its file and cameras, to one sphere, and apply masks.
+
+    `of_one` tells how well the focal length of a picture's one camera is known.
+    """
+    cameras = tuple(mount for *_, mounts in shots for mount in mounts)
+    width = sphere_width(cameras)
+    num_bytes = width * width // 2 * PICTURE_BYTES_PER_PIXEL
+    check_memory(num_bytes, f"{photo.path}: the sphere of {width} x {width // 2}", "make the picture smaller")
+    views: list[View] = []
+    notes: list[str] = []
+    counts = None
+    for file, picture, mounts in shots:
+        masks = _user_masks(file, [picture.size, (width, width // 2)], photo, notes)
+        if 1 in masks:
+            counts = masks[1] if counts is None else counts & masks[1]
+        is_valid = picture.is_valid & masks[0] if 0 in masks else picture.is_valid
+        found, more = read_views(file, picture, mounts, is_valid)
+        views += found
+        notes += [*picture.warnings, *more]
+    rgb, is_valid = make_sphere(views, width)
+    panorama = Panorama(rgb, is_valid, attitude, tuple(dict.fromkeys(notes)), cameras)
+    masked = _mask(photo, panorama, counts)
+    if of_one is None or len(cameras) > 1:
+        return masked
+    is_hidden = is_valid & ~masked.is_valid
+    if not is_hidden.any():
+        is_hidden = np.zeros(is_valid.shape, np.bool_)  # it mostly takes no memory
+    focal = cameras[0].camera.focal[0]
+    prior = FocalPrior(focal, of_one.deviation, of_one.source, views[0], is_hidden)
+    return replace(masked, focal_prior=prior)
+
+
+def panorama_size(path: Path) -> tuple[int, int]:
+    """Return width and height [px] of a file's panorama, not decoded; InputError if EXIF rotates it."""
+    size, orientation = picture_shape(face_paths(path)["f"] if path.is_dir() else path)
+    if path.is_dir():
+        return 4 * size[0], 2 * size[0]
+    if orientation not in (None, 1):
+        turned = f"found it stored rotated (EXIF orientation {orientation})"
+        raise InputError(f"{path}: {turned}, wanted it upright")
+    return size
+
+
+def _read_labelled(photo: Photo, labels: Labels) -> Panorama:
+    """Read the panorama in a PNG of labels. No automatic masks: a black border is a label too."""
+    path = photo.path
+    picture = read_labels(path, labels)
+    width, height = picture.size
+    if width != 2 * height:
+        raise InputError(f"{path}: found labels of {width} x {height}, wanted the full sphere, W = 2 H")
+    notes = list(picture.warnings)
+    counts = _user_masks(path, [picture.size], photo, notes).get(0)
+    fields = gpano.gpano_fields(picture.xmp)
+    attitude = gpano.attitude(fields) if fields else None
+    return _mask(photo, Panorama(picture.rgb, picture.is_valid, attitude, tuple(notes)), counts)
+
+
+def _region_of(photo: Photo, picture: Picture, fields: dict[str, str]) -> tuple[CropRegion, list[str]]:
+    """Return the part of the sphere that a picture shows, by the user or metadata, and warnings."""
+    width, height = picture.size
+    if photo.fov_deg is not None:
+        notes = [LIKE_A_PHOTO] if photo.projection is None and not fields and _is_like_photo(picture) else []
+        return gpano.region_of_fov(photo.fov_deg, width, height), notes
+    name = fields.get("ProjectionType", "").lower()
+    if name not in ("", "equirectangular"):
+        wanted = "wanted equirectangular, or of a cylinder `projection` cylindrical and `fov_deg`"
+        raise InputError(f"{photo.path}: its metadata names the projection {name!r}, {wanted}")
+    if width == height and shows_twice(picture.rgb, 0):
+        raise InputError(f"{photo.path}: two panoramas above each other, one for each eye, wanted one")
+    notes = [NO_HORIZON] if gpano.lacks_horizon(fields) else []
+    region = gpano.crop_region(fields, width / height)
+    is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
+    missing = [name for name in gpano.CROP_FIELDS if fields and name not in fields]
+    if region is None and is_two_to_one:
+        region = CropRegion()
+        notes = ["the crop in the metadata is invalid or has another shape; read as a full sphere"]
+    if region is None or (region.is_full and not is_two_to_one):
+        wrong = "no field of view is given" if photo.projection else "no focal length in EXIF"
+        wrong = "a crop in the metadata that does not fit it" if region is None else wrong
+        wrong = f"a crop in the metadata without {missing[-1]}" if missing else wrong
+        found = f"found a picture of {width} x {height}, which is no full panorama (2:1), and {wrong}"
+        raise InputError(f"{photo.path}: {found}. {CHOICES.format(PHOTO_FOV_DEG[width < height])}")
+    if region.is_full and is_dual_fisheye(picture.rgb):
+        found = "two fisheye pictures side by side, wanted their calibration as `camera` (docs/CAMERAS.md)"
+        raise InputError(f"{photo.path}: {found}, or a panorama that the camera's program has stitched")
+    if region.is_full and shows_twice(picture.rgb, 1):
+        found = "two half spheres side by side, one for each eye (VR180)"
+        raise InputError(f"{photo.path}: {found}, wanted a full sphere, or one of them as a fisheye photo")
+    return region, notes
+
+
+def _unroll(picture: Picture, angle: float) -> Picture:
+    """Return a cylinder's picture, which shows `angle` [rad] across, as a strip of the sphere."""
+    width, height = picture.size
+    radius = width / angle  # [px]
+    half = math.atan(height / 2.0 / radius)
+    elevations = half - (np.arange(max(round(2.0 * half * radius), 1)) + 0.5) / radius
+    rows = (height / 2.0 - radius * np.tan(elevations) - 0.5).astype(np.float32)
+    u, v = np.meshgrid(np.arange(width, dtype=np.float32), rows)
+    rgb = cv2.remap(picture.rgb, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    counts = cv2.remap(picture.is_valid.astype(np.uint8), u, v, cv2.INTER_NEAREST)
+    return replace(picture, rgb=np.asarray(rgb, np.uint8), is_valid=np.asarray(counts > 0))
+
+
+def _is_like_photo(picture: Picture) -> bool:
+    """Return True for a picture of the shape of a camera's photos, upright or not."""
+    ratio = max(picture.size) / min(picture.size)
+    return any(abs(ratio / camera_ratio - 1.0) <= ASPECT_TOLERANCE for camera_ratio in CAMERA_RATIOS)
+
+
+def _embed_and_mask(photo: Photo, picture: Picture, region: CropRegion, attitude: GPano | None) -> Panorama:
+    """Embed the picture in the full sphere, and mask all pixels that do not count."""
+    path = photo.path
+    size = gpano.full_size(path, region, picture.size)
+    notes = [*picture.warnings]
+    masks = _user_masks(path, [size, picture.size], photo, notes)
+    is_valid = picture.is_valid & masks[1] if 1 in masks else picture.is_valid
+    borders = black_borders(picture.rgb, is_valid, region.is_full)
+    if borders is not None:
+        is_valid = is_valid & ~borders
+        fraction = _sphere_fraction(borders, region)
+        if fraction >= MIN_REPORTED_SHARE:
+            notes.append(f"masked black borders: {100 * fraction:.1f} % of the sphere")
+    rgb, is_valid = gpano.embed_crop(path, picture.rgb, is_valid, region)
+    for pole in ("zenith", "nadir"):
+        half_angle = polar_disc(rgb, is_valid, pole)
+        if half_angle:
+            notes.append(f"masked a {pole} patch of {half_angle:.1f} deg")
+            is_valid = mask_pole(is_valid, pole, half_angle)
+    return _mask(photo, Panorama(rgb, is_valid, attitude, tuple(notes)), masks.get(0))
+
+
+def _mask(photo: Photo, panorama: Panorama, counts: Mask | None) -> Panorama:
+    """Return the panorama without pixels removed by a mask of its size or the option for the nadir."""
+    is_valid = panorama.is_valid if counts is None else panorama.is_valid & counts
+    is_valid = mask_pole(is_valid, "nadir", photo.mask_nadir_deg)
+    if not is_valid.any():
+        raise InputError(f"{photo.path}: no pixel is left: all are masked, black, or of ignored labels")
+    return replace(panorama, is_valid=np.ascontiguousarray(is_valid))
+
+
+def _user_masks(path: Path, sizes: list[tuple[int, int]], photo: Photo, notes: list[str]) -> dict[int, Mask]:
+    """Return the user's mask, True where pixels count, by the index of the size whose shape it has."""
+    if photo.mask is None or isinstance(photo.mask, np.ndarray):
+        return {}
+    file = find_mask(Path(photo.mask), path)
+    if file is None:
+        notes.append(f"found no mask {path.stem} in {photo.mask}")
+        return {}
+    is_folder = Path(photo.mask).is_dir()
+    if is_black_ignored := is_folder and file.stem != path.stem:  # a name that COLMAP or Metashape gives
+        notes.append(f"of the mask {file.name}, black is ignored, as COLMAP and Metashape have it")
+    index, counts = read_mask(file, sizes, is_black_ignored)
+    return {index: counts}
+
+
+def _sphere_fraction(is_there: Mask, region: CropRegion) -> float:
+    """Return the fraction of the sphere that a part (H, W) of a picture of `region` covers."""
+    rows = (np.arange(len(is_there)) + 0.5) / len(is_there) * region.height + region.top
+    per_row = is_there.mean(axis=1) * np.sin(np.clip(rows, 0.0, 1.0) * np.pi)
+    return float(per_row.mean() * region.width * region.height * np.pi / 2.0)

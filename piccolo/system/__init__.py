@@ -1,0 +1,1 @@
+"""For all rooms: errors, types of arrays, files, threads and processes, compiled kernels."""
