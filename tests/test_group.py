@@ -15,7 +15,8 @@ from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import NO_CANDIDATE
-from piccolo.judge.result import nothing_found
+from piccolo.judge.reasons import MIRRORED, Reason
+from piccolo.judge.result import Result, nothing_found
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.photo.panorama import Panorama
 from piccolo.system.jobs.threads import Stopwatch, Workers
@@ -24,6 +25,7 @@ from piccolo.together.bundle_search import Support
 from piccolo.together.group import Expected, localize_group, weigh_supports
 from piccolo.together.links import FIRM, WEAK, Links, Placed, compute_shared, find_links, list_pairs, spread
 from piccolo.together.members import Shot
+from piccolo.together.mirrored import refuse_mirrored
 
 TIER = "scene"
 SUPPORT = Support(NO_CANDIDATE, None, is_found=True, odds=1.0, odds_elsewhere=0.0, num_places=100)
@@ -198,6 +200,22 @@ def test_a_mirrored_photo_is_linked_with_none():
     mirrored = replace(photo, rgb=photo.rgb[:, ::-1], is_valid=photo.is_valid[:, ::-1])
     problems = {**_problems(), 1: rooms.ask(mirrored, rooms.scan_map(SEED), rooms.KNOWN)}
     assert find_links(problems, rooms.WORKERS).list_linked(1) == []
+
+
+@pytest.mark.parametrize("is_mirrored", [False, True])
+def test_photos_together_are_refused_if_the_mirror_image_of_one_is_sure(is_mirrored):
+    ((photo, _),) = rooms.take_photos(SEED, 150.0, {1: [0.0, 0.0, 0.0]})
+    if is_mirrored:
+        photo = replace(photo, rgb=photo.rgb[:, ::-1], is_valid=photo.is_valid[:, ::-1])
+    problem = rooms.ask(photo, rooms.scan_map(SEED), rooms.KNOWN)
+    members = {0: SimpleNamespace(found=SimpleNamespace(problem=problem))}
+    together = {0: Result(status="localized", belief=make_belief([0.95]))}
+    result = refuse_mirrored(together, members, rooms.means(rooms.KNOWN), 0.9)[0]
+    assert result.status == ("not_localized" if is_mirrored else "localized")
+    assert (Reason.MIRRORED in result.belief.ruled_out) == is_mirrored
+    assert (MIRRORED in result.warnings) == is_mirrored
+    unsure = {0: nothing_found()}
+    assert refuse_mirrored(unsure, {}, rooms.means(rooms.KNOWN), 0.9) == unsure
 
 
 def _together(photos, num_threads=2):
