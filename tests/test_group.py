@@ -203,19 +203,23 @@ def test_a_mirrored_photo_is_linked_with_none():
 
 
 @pytest.mark.parametrize("is_mirrored", [False, True])
-def test_photos_together_are_refused_if_the_mirror_image_of_one_is_sure(is_mirrored):
+def test_photos_together_are_refused_if_they_fit_better_mirrored(is_mirrored):
     ((photo, _),) = rooms.take_photos(SEED, 150.0, {1: [0.0, 0.0, 0.0]})
     if is_mirrored:
         photo = replace(photo, rgb=photo.rgb[:, ::-1], is_valid=photo.is_valid[:, ::-1])
+    alone = rooms.locate(photo, rooms.scan_map(SEED), rooms.KNOWN)
     problem = rooms.ask(photo, rooms.scan_map(SEED), rooms.KNOWN)
-    members = {0: SimpleNamespace(found=SimpleNamespace(problem=problem))}
+    members = {0: SimpleNamespace(found=SimpleNamespace(problem=problem), alone=alone)}
     together = {0: Result(status="localized", belief=make_belief([0.95]))}
-    result = refuse_mirrored(together, members, rooms.means(rooms.KNOWN), 0.9)[0]
+    result = refuse_mirrored(together, members, {0: SUPPORT}, rooms.means(rooms.KNOWN), 0.9)[0]
     assert result.status == ("not_localized" if is_mirrored else "localized")
     assert (Reason.MIRRORED in result.belief.ruled_out) == is_mirrored
     assert (MIRRORED in result.warnings) == is_mirrored
+
+
+def test_of_photos_that_are_not_localized_the_mirror_images_are_not_searched():
     unsure = {0: nothing_found()}
-    assert refuse_mirrored(unsure, {}, rooms.means(rooms.KNOWN), 0.9) == unsure
+    assert refuse_mirrored(unsure, {}, {}, rooms.means(rooms.KNOWN), 0.9) == unsure
 
 
 def _together(photos, num_threads=2):

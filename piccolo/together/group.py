@@ -152,7 +152,8 @@ def localize_linked(members: Mapping[int, Member], means: Means, demand: Demand)
             if probabilities[0] >= EVEN_ODDS:
                 found = judge_group(group, tested, probabilities, means, demand)
                 if not list_sure(group, tested[0]):
-                    found = refuse_mirrored(found, members, means, demand.min_confidence)
+                    supports = tested[0].supports
+                    found = refuse_mirrored(found, members, supports, means, demand.min_confidence)
             for k, result in found.items():
                 grouped[k] = Grouped(result, tuple(other for other in found if other != k))
             left -= found.keys() or tested[0].places.keys()
