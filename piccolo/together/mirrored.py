@@ -19,7 +19,7 @@ from ..localization.means import Means
 from .bundle_search import Support
 from .members import Member
 
-# Chosen: of mirrored photos, against the photos as they are. Of 15 single photos of a hospital none had more than
+# Chosen: of mirrored photos, against the photos as they are. Of 15 photos of a hospital none had more than
 # 0.41; two of racks that were mirrored had 1.8 together.
 LEAST_LOG_ODDS = 1.0
 
