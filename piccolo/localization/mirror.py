@@ -8,6 +8,7 @@ from ..evidence.examine import count_agreeing
 from ..geometry.pose import Pose, uniform_yaws
 from ..judge.candidate import Candidate
 from ..judge.selection import explains_more
+from ..problem.method import Method
 from ..problem.photo_images import MIRROR
 from ..problem.problem import Problem
 from ..problem.settings import Effort
@@ -24,16 +25,24 @@ UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 def find_mirrored(problem: Problem, best: Candidate, effort: Effort, workers: Workers) -> Candidate | None:
     """Return the best pose of the mirrored photo; None if there is none that explains more.
 
-    Not searched are photos with a score that is enough, scans without colours, and poses by whole views
-    alone: the first look has compared these with the mirrored photo.
+    Not searched are photos that are explained well and have many matches, scans without colours, and poses by
+    whole views alone: the first look has compared these with the mirrored photo.
     """
-    if best.score >= problem.method.enough_explained or not problem.profile.uses_matches:
+    if is_explained(problem.method, best) or not problem.profile.uses_matches:
         return None
     mirrored = problem.mirror()
     found = search_mirrored(problem, mirrored, best.pose, effort, workers)
     if not found or not explains_more(problem.method, found[0], best):
         return None
     return count_agreeing(mirrored, found[0], workers)
+
+
+def is_explained(method: Method, best: Candidate) -> bool:
+    """Return True if a pose explains a photo so well that it is not mirrored.
+
+    A score alone does not tell: a thin wall, seen from behind, explains much of a mirrored photo of its front.
+    """
+    return best.score >= method.enough_explained and (best.num_matches or 0) >= method.enough_matches
 
 
 def search_mirrored(

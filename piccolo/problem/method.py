@@ -56,7 +56,7 @@ class Method:
 
     # mirrored photos
     worth_asking: float = 0.2  # least probability of all poses together for which the mirrored photo is tried
-    enough_explained: float = 0.7  # with this score a photo is not mirrored
+    enough_explained: float = 0.7  # with this score and `enough_matches` a photo is not mirrored
     mirror_ratio: float = 1.05  # least ratio of scores, mirrored photo to photo
 
     def __post_init__(self) -> None:
