@@ -17,7 +17,7 @@ ANYWHERE = seeded_cloud(2, num_points=1200)
 RAW = RawCloud(np.rint(ANYWHERE.points_world / SCALES) * SCALES + OFFSETS, ANYWHERE.colors)
 
 
-def las_bytes(raw, point_format=3, colors=None, withheld=None, extra_bytes=0, intensity=None, classes=None):
+def las_bytes(raw, point_format=3, colors=None, withheld=None, extra_bytes=0, intensity=None):
     """A LAS file of a cloud; `colors` (N, 3) uint16 default to the cloud's in full 16 bits."""
     header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format > 5 else "1.3")
     header.scales, header.offsets = SCALES, OFFSETS
@@ -30,8 +30,6 @@ def las_bytes(raw, point_format=3, colors=None, withheld=None, extra_bytes=0, in
         las.red, las.green, las.blue = colors.T
     if intensity is not None:
         las.intensity = intensity
-    if classes is not None:
-        las.classification = classes
     if withheld is not None:
         las.withheld = withheld
     content = io.BytesIO()

@@ -173,7 +173,7 @@ def test_of_many_frames_those_are_taken_between_which_the_picture_changes(tmp_pa
     assert [at[k] for k in chosen] == sorted({at[k] for k in chosen}), "no view twice"
 
 
-@pytest.mark.parametrize("options", [["--walk"], ["--relative", "poses.txt"], ["--jobs", "2"], ["--labels"]])
+@pytest.mark.parametrize("options", [["--walk"], ["--relative", "poses.txt"], ["--jobs", "2"]])
 def test_what_does_not_go_with_it_is_refused_with_the_reason(folder, options, capsys):
     assert main(_command(folder, "--together", *options)) == 2
     (line,) = capsys.readouterr().err.splitlines()

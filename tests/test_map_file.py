@@ -56,7 +56,6 @@ def test_round_trip_and_a_file_cut_short(tmp_path):
     assert len(back.places.positions) > 1
     np.testing.assert_array_equal(back.views.centers, back.centers)
     assert isinstance(back.scan_sha256, str)
-    assert back.has_labels is False
     np.testing.assert_array_equal(back.octree.nodes, made.octree.nodes)
     (tmp_path / "b.map").write_bytes(built.read_bytes()[:-1000])
     assert_input_error(r"b\.map: ", load_map, tmp_path / "b.map")

@@ -106,7 +106,7 @@ def test_conditions_differ_and_have_files_of_their_own(name):
     conditions = conditions_of(EXPERIMENTS[name], PRESETS, ["change", "clean"])
     assert len(conditions) >= 2
     assert len({reproduce_paper.file_name(condition) for condition in conditions}) == len(conditions)
-    tried = {(repr(c.settings), repr(c.transform), c.variants, c.use_labels) for c in conditions}
+    tried = {(repr(c.settings), repr(c.transform), c.variants) for c in conditions}
     assert len(tried) == len(conditions)
 
 
@@ -123,7 +123,7 @@ def test_the_tool_writes_table_and_runs_and_resumes_them(rooms, tmp_path, capsys
     assert "| tilt |" not in text
     rows = read_run(out / "labels" / "labels_paper.jsonl")[0]
     assert [row.scene for row in rows] == ["000", "001"]
-    assert rows[0].result.pano.endswith("labels/clean_0.png")
+    assert rows[0].result.pano.endswith("images/clean_0.jpg")
     assert rows[0].result.settings["num_translations"] == 8
     before = (out / "labels.md").read_text()
     assert _command("labels variants", rooms, out, "--variants", "clean") == 0

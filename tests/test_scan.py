@@ -155,7 +155,6 @@ def test_each_option_is_described_where_it_is_given(kind):
         ({"num_threads": "2"}, "`num_threads`: found '2', wanted a whole number"),
         ({"colors": [1, 2, 3]}, "`colors`: found .*, wanted an array"),
         ({"colors": np.zeros((1, 3))}, "colors: found shapes"),
-        ({"ignore_labels": [1]}, "`ignore_labels`: only with `labels`"),
         ({"progress": 1}, "`progress`: found 1, wanted a function"),
     ],
 )

@@ -368,8 +368,7 @@ def test_arrays_and_files_without_colours_are_scans(tmp_path):
         assert SHAPE_ALONE in piccolo.open_scan(source, cache=False).warnings
 
 
-def test_options_that_do_not_go_with_the_shape_are_refused(tmp_path):
-    assert_input_error("`ignore_colors`", piccolo.Cloud, tmp_path / "a.ply", ignore_colors=True, labels=True)
+def test_the_preset_paper_wants_colors():
     bare = piccolo.Cloud(rooms.room(1)[1].points, ignore_colors=True)
     with pytest.raises(InputError, match="found no colours to be used, wanted some for the preset paper"):
         piccolo.open_scan(bare, settings=piccolo.PaperSettings())

@@ -52,10 +52,6 @@ class Cloud:
         Axis of the scan that points up; "auto" is z, in glTF files y.
     ignore_colors
         Use the shape of the scan, and intensities, even if it has colours.
-    labels
-        Use semantic labels in place of colours, in scan and panoramas.
-    ignore_labels
-        Labels that are left out of the scan and masked in panoramas. Only with `labels`.
     color_range
         Full brightness of the colours: 1, 255 or 65535. By default it follows from the files.
     columns
@@ -77,8 +73,6 @@ class Cloud:
     units: Units | None = None
     up: UpAxis = "auto"
     ignore_colors: bool = False
-    labels: bool = False
-    ignore_labels: Sequence[int] = ()
     color_range: float | None = None
     columns: Sequence[str] = ()
     crs: str | None = None
@@ -86,8 +80,6 @@ class Cloud:
     def __post_init__(self) -> None:
         """Refuse values that mean nothing, naming the option."""
         check_fields(self)
-        if self.ignore_labels and not self.labels:
-            raise InputError("`ignore_labels`: only with `labels`")
         if not isinstance(self.source, np.ndarray):
             if self.colors is not None:
                 raise InputError("`colors`: found files, wanted an array of points")
@@ -109,7 +101,6 @@ class Cloud:
         """Settings with which the scan is read."""
         return CloudSettings.of_options(
             self.ignore_colors,
-            self.ignore_labels if self.labels else None,
             scale=METRES[self.units] if self.units else None,
             up=self.up,
             crs=self.crs,

@@ -9,7 +9,7 @@ from ..cloud.settings import CloudSettings, from_wgs84
 from ..judge.result import FAILED, UNREADABLE, Result
 from ..judge.result_parts import FocalLength, Source
 from ..localization.paper import PaperSettings
-from ..photo.panorama import Panorama, check_labels, read_panorama
+from ..photo.panorama import Panorama, read_panorama
 from ..photo.panorama.facts import PhotoFacts, read_photo_facts, sha256_of
 from ..photo.photo import GpsPrior, Photo, Prior
 from ..problem.settings import CoarseToFineSettings
@@ -18,7 +18,6 @@ from ..system.files.json_file import reading_once
 from ..system.jobs.memory import is_shortage
 from ..system.jobs.threads import Stopwatch
 
-LABELS_WARNING = "`labels`: the confidence was fitted to colours; with labels it is a rough estimate"
 Settings = CoarseToFineSettings | PaperSettings
 
 
@@ -32,20 +31,12 @@ class PhotoReader:
     crs: str  # coordinate system of the scan; empty if it is not known
     warnings: tuple[str, ...]  # about the scan
 
-    def check(self, photo: Photo) -> None:
-        """Raise InputError for a photo of labels in a scan of colours, or the other way."""
-        check_labels(photo, self.cloud_settings.labels)
-
-    def read(self, photo: Photo) -> Panorama:
-        """Read a photo, of labels if the scan is one of labels."""
-        return read_panorama(photo, self.cloud_settings.labels)
-
     def take(
         self, photo: Photo, watch: Stopwatch, focal: FocalLength | None = None
     ) -> tuple[Panorama, PhotoFacts]:
         """Read a photo and its facts; `focal` says what other photos of its camera know, if anything."""
         with watch.stage("read"), reading_once():
-            picture = self.read(photo)
+            picture = read_panorama(photo)
             if focal is not None and focal.others_px is not None and focal.others_std_px is not None:
                 picture = picture.expect_focal(focal.others_px, focal.others_std_px / focal.others_px)
             return picture, read_photo_facts(photo)
@@ -59,13 +50,12 @@ class PhotoReader:
         seconds: dict[str, float],
     ) -> Result:
         """Return the result of a photo that is not localized yet."""
-        has_labels = self.cloud_settings.labels is not None
         return Result(
             cloud=self.scan,
             pano=photo.name,
             seconds=seconds,
             settings=settings_json(settings, self.cloud_settings, photo),
-            warnings=self.warnings + picture.warnings + ((LABELS_WARNING,) if has_labels else ()),
+            warnings=self.warnings + picture.warnings,
             source=Source(self.scan_sha256, facts.sha256, facts.image_size, facts.capture_time),
             cameras=picture.cameras,
         )
@@ -95,9 +85,7 @@ class PhotoReader:
 
 def settings_json(settings: Settings, cloud_settings: CloudSettings, photo: Photo) -> dict[str, object]:
     """Return the settings as a result's JSON has them."""
-    labels = cloud_settings.labels and asdict(cloud_settings.labels)
-    reading = {**photo.to_json(), "labels": labels}
-    return {**settings.to_json(), "cloud": asdict(cloud_settings), "panorama": reading}
+    return {**settings.to_json(), "cloud": asdict(cloud_settings), "panorama": photo.to_json()}
 
 
 def describe_failure(error: Exception) -> str:

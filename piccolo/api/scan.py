@@ -15,6 +15,7 @@ from ..judge.result import Result
 from ..judge.result_parts import FocalLength
 from ..localization.means import NO_TRACE, Trace
 from ..localization.paper import PaperMap
+from ..photo.panorama import read_panorama
 from ..photo.photo import File, Photo, Prior, as_photo
 from ..problem.accuracy import Accuracy
 from ..problem.settings import CoarseToFineSettings
@@ -363,11 +364,10 @@ class Scan:
         photo contradicts the scan, 0 where the scan explains it, 128 where one of them shows nothing.
         """
         pose = self.from_world(pose)
-        return occlusion_mask(self.points, self.reader.read(as_photo(photo)), pose)
+        return occlusion_mask(self.points, read_panorama(photo), pose)
 
     def check_options(self, photo: Photo, settings: Settings) -> None:
         """Raise InputError for options that this scan or its method does not have."""
-        self.reader.check(photo)
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
             check_within(self.prepared, settings.prior.within)
         elif given := [name for name in ONLY_DEFAULT if getattr(photo, name)]:

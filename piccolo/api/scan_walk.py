@@ -11,7 +11,7 @@ from ..geometry.pose import Pose, check_pose
 from ..judge.result import Result
 from ..judge.result_parts import WalkFrame
 from ..localization.places import add_places
-from ..photo.panorama import Panorama
+from ..photo.panorama import Panorama, read_panorama
 from ..photo.panorama.facts import read_photo_facts, sha256_of
 from ..photo.photo import File, Photo, as_photo
 from ..problem.problem import Problem
@@ -90,7 +90,6 @@ class Walk:
         photo = as_photo(frame)
         name = name or photo.name
         settings = self.tracker.settings
-        self.reader.check(photo)
         if photo.refine_focal:
             raise InputError(NO_REFINING)
         with reading_once():
@@ -161,7 +160,7 @@ class Walk:
 
     def _read(self, photo: Photo, name: str) -> Panorama:
         """Read a photo, which warnings call by its name; its focal length counts as exact."""
-        panorama = self.reader.read(photo)
+        panorama = read_panorama(photo)
         path = name if isinstance(photo.picture, np.ndarray) else photo.name
         warnings = tuple(warning.replace(path, name) for warning in panorama.warnings)
         return replace(panorama, focal_prior=None, warnings=warnings)

@@ -20,6 +20,7 @@ from ..judge.result import Result
 from ..judge.result_parts import Source
 from ..localization.means import Step, Trace
 from ..photo.camera import Calibration
+from ..photo.panorama import read_panorama
 from ..photo.photo import Photo, Vector
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.map_file import load_map
@@ -239,7 +240,7 @@ class Localizer:
         photo = photo.with_refined_camera(result.cameras)
         if self.makes_overlays:
             local = scan.prepared.from_world(pose)
-            overlay = overlay_png(scan.prepared.points, scan.reader.read(photo), local, scan.workers)
+            overlay = overlay_png(scan.prepared.points, read_panorama(photo), local, scan.workers)
         if self.makes_occlusion_masks:
             mask = encode_image(scan.occlusion_mask(photo, pose), ".png")
         return overlay, mask

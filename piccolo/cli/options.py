@@ -86,8 +86,6 @@ def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
     option(group, "--color-range", text, choices=ranges, default=ranges[0])
     text = "columns of text, PTS and .npy files, as x,y,z,i,r,g,b; - for others (default: by a header or "
     option(group, "--columns NAMES", text + "their values)", type=lambda names: names.split(","), default=[])
-    text = "compare semantic labels instead of colours: of points (PLY, LAS, LAZ, PCD) and label images (PNG)"
-    option(group, "--labels N ...", f"{text}; points and pixels with labels N are left out", nargs="*")
 
 
 def _metres_of(text: str) -> float:

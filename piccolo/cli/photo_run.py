@@ -285,7 +285,7 @@ def note_left_handed(run: Run, records: Records, answering: Answering, interrupt
         paths = [folder / f"{k}.png" for k in range(NUM_MIRRORED)]
         for path, photo in zip(paths, run.doubtful, strict=False):
             photo_asked, _ = localizer.ask(Path(photo))
-            panorama = read_panorama(photo_asked, localizer.cloud_settings.labels)
+            panorama = read_panorama(photo_asked)
             shown = np.dstack([panorama.rgb, np.uint8(255) * panorama.is_valid])
             path.write_bytes(encode_image(shown[:, ::-1], ".png"))
         answers = answering.answer_all(map(localizer.task, paths))

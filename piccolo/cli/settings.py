@@ -10,7 +10,6 @@ from ..api.scan import ONLY_DEFAULT
 from ..batch.localizer import Localizer
 from ..cloud.settings import CloudSettings
 from ..localization.paper import PaperSettings
-from ..photo.panorama import check_labels
 from ..photo.photo import NOTHING_KNOWN, Photo, Prior
 from ..problem.accuracy import Accuracy
 from ..problem.settings import CoarseToFineSettings
@@ -27,7 +26,6 @@ def cloud_settings_from(arguments: Arguments) -> CloudSettings:
     crs = vars(arguments).get("crs")  # not of commands without photos
     return CloudSettings.of_options(
         arguments.ignore_colors,
-        arguments.labels,
         scale=arguments.units,
         up=arguments.up,
         crs=None if crs == NONE else crs,
@@ -47,7 +45,6 @@ def localizer_from(arguments: Arguments, paths: tuple[Path, ...] = ()) -> Locali
     cloud_settings = cloud_settings_from(arguments)
     names = {f.name for f in fields(Photo)}
     photo = Photo(Path(), **{name: value for name, value in vars(arguments).items() if name in names})
-    check_labels(photo, cloud_settings.labels)
     return Localizer(paths, settings_from(arguments), cloud_settings, photo, cache_from(arguments))
 
 

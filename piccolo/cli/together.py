@@ -45,7 +45,6 @@ IN_TURN = "its frames come one after another"
 AS_ONE = "its photos are weighed as one camera, in one process"
 IN_GROUPS = "which photos belong together is decided in one process"
 NO_WALK = "its photos are in no order, so no way between them is followed"
-NO_COLORS = "labels are no colours"
 IN_ROUNDS = "a photo needs the colours of all others"
 OTHER = "photos are localized together in one way"
 NOT_WITH: Mapping[str, Mapping[str, str]] = {  # options that do not go with what is asked for, and why
@@ -64,7 +63,6 @@ NOT_WITH: Mapping[str, Mapping[str, str]] = {  # options that do not go with wha
         "odometry": NO_WALK,
         "jobs": IN_GROUPS,
         "dask": IN_GROUPS,
-        "labels": NO_COLORS,
     },
     "--color-scan": {
         "walk": OTHER,
@@ -73,7 +71,6 @@ NOT_WITH: Mapping[str, Mapping[str, str]] = {  # options that do not go with wha
         "together": OTHER,
         "jobs": IN_ROUNDS,
         "dask": IN_ROUNDS,
-        "labels": NO_COLORS,
     },
 }
 ONLY_WITH_WALKS = ("times", "max_speed", "odometry")

@@ -1,13 +1,11 @@
 """Settings for reading the files of a cloud."""
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ..geometry.colors import Labels
 from ..geometry.pose import rotation_to_z
 from ..system.arrays import Array
 from ..system.errors import InputError, import_optional
@@ -29,23 +27,17 @@ class CloudSettings:
     scale: float | None = None  # metres per unit of the files; None: by the file, else 1
     up: UpAxis = "auto"  # the axis that points up; auto: the one of the file, z or in glTF y
     channels: tuple[Channel, ...] = get_args(Channel)  # the first one that the files have is taken
-    labels: Labels | None = None  # the points' labels are taken for their colours
     crs: str | None = None  # coordinate system, such as EPSG:25832; None: what the file names
     color_range: float | None = None  # the value of full brightness; None: by the file
     columns: tuple[str, ...] = ()  # names of the numbers of a line, such as x y z i r g b; none: by the file
 
     @classmethod
-    def of_options(
-        cls, ignore_colors: bool, ignored_labels: Iterable[int] | None, **others: Any
-    ) -> "CloudSettings":
-        """Return the settings that options of users ask for; None for colours in place of labels."""
+    def of_options(cls, ignore_colors: bool, **others: Any) -> "CloudSettings":
+        """Return the settings that options of users ask for."""
         channels = WITHOUT_COLORS if ignore_colors else BY_FILE.channels
-        labels = None if ignored_labels is None else Labels(tuple(sorted(set(ignored_labels))))
-        return cls(channels=channels, labels=labels, **others)
+        return cls(channels=channels, **others)
 
     def __post_init__(self) -> None:
-        if self.labels and "colors" not in self.channels:
-            raise InputError("`ignore_colors`, `labels`: found both, wanted one of them")
         if self.up not in get_args(UpAxis):
             raise InputError(f"`up`: found {self.up!r}, wanted one of {', '.join(get_args(UpAxis))}")
         if self.scale is not None and not (math.isfinite(self.scale) and self.scale > 0.0):

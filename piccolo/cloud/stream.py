@@ -206,7 +206,6 @@ class CloudFormat(NamedTuple):
     has_magic: Callable[[bytes], object]  # true of a file's first HEAD_SIZE bytes; content goes before names
     # MissingChannelError if the file has no such channel
     open_source: Callable[[Path, CloudSettings, Channel], reader.PointSource]
-    has_labels: bool = False  # the reader knows them
     has_columns: bool = False  # that can be named
 
 
@@ -215,10 +214,10 @@ def _begins(*magic: bytes) -> Callable[[bytes], bool]:
 
 
 FORMATS = (
-    CloudFormat("PLY", (".ply",), _begins(*ply.MAGIC), ply.open_ply, has_labels=True),
-    CloudFormat("LAS, LAZ", (".las", ".laz"), _begins(las_file.MAGIC), las.open_las, has_labels=True),
+    CloudFormat("PLY", (".ply",), _begins(*ply.MAGIC), ply.open_ply),
+    CloudFormat("LAS, LAZ", (".las", ".laz"), _begins(las_file.MAGIC), las.open_las),
     CloudFormat("E57", (".e57",), _begins(e57_file.MAGIC), e57.open_e57),
-    CloudFormat("PCD", (".pcd",), pcd.FIRST_LINES.match, pcd.open_pcd, has_labels=True),
+    CloudFormat("PCD", (".pcd",), pcd.FIRST_LINES.match, pcd.open_pcd),
     CloudFormat("PTX", (".ptx",), text.has_ptx_magic, text.open_ptx),
     CloudFormat("PTS", (".pts",), _begins(), partial(text.open_text, has_counts=True), has_columns=True),
     CloudFormat("NumPy .npz", (".npz",), npz.has_npz_magic, npz.open_npz),
@@ -262,9 +261,6 @@ def open_source(path: Path, settings: CloudSettings = BY_FILE) -> reader.PointSo
     """Return the points of a file in any supported format, in the first of the channels that it has."""
     try:
         format_ = _format_of(path)
-        if settings.labels and not format_.has_labels:
-            known = ", ".join(f.name for f in FORMATS if f.has_labels)
-            raise InputError(f"{path}: labels are not read from {format_.name}, wanted {known}")
         if settings.columns and not format_.has_columns:
             known = ", ".join(f.name for f in FORMATS if f.has_columns)
             raise InputError(f"{path}: {format_.name} names its columns; `columns` is for {known}")
@@ -282,7 +278,7 @@ def open_source(path: Path, settings: CloudSettings = BY_FILE) -> reader.PointSo
 def _open_channel(format_: CloudFormat, path: Path, settings: CloudSettings) -> reader.PointSource:
     """Return the points in the first channel that the file has, with a warning if it has no colours."""
     missing: list[reader.MissingChannelError] = []
-    for channel in ("colors",) if settings.labels else settings.channels:
+    for channel in settings.channels:
         try:
             source = format_.open_source(path, settings, channel)
         except reader.MissingChannelError as error:
@@ -295,7 +291,7 @@ def _open_channel(format_: CloudFormat, path: Path, settings: CloudSettings) -> 
 
 def _hint(format_: CloudFormat, path: Path, settings: CloudSettings) -> str:
     """Return what to add to the refusal of a file that would be read without its colours."""
-    if settings.labels or settings.channels != BY_FILE.channels:
+    if settings.channels != BY_FILE.channels:
         return ""
     try:
         format_.open_source(path, settings, "shape")

@@ -1,26 +1,9 @@
-"""Colours packed as kernels read them; labels as colours far apart in RGB, equal in clouds and panoramas."""
-
-import functools
-from dataclasses import dataclass
+"""Colours: sRGB and linear light, packed as kernels read them, made of edges."""
 
 import cv2
 import numpy as np
 
-from ..system.arrays import Array, Bytes, Floats, Int32s, Integers, Mask
-
-NUM_LEVELS = 16  # of a channel that colours are made of
-NUM_COLORS = 4093  # a prime: labels that count in steps of 256 or 65,536 do not fall together
-
-
-@dataclass(frozen=True)
-class Labels:
-    """The meaning of labels."""
-
-    ignored: tuple[int, ...] = ()  # values that say nothing: masked in panoramas, left out of clouds
-
-    def are_kept(self, labels: Integers) -> Mask:
-        """Return True for the labels (...) that are not ignored."""
-        return np.isin(labels, self.ignored, invert=True)
+from ..system.arrays import Array, Bytes, Floats, Int32s, Mask
 
 
 def srgb_to_linear(colors: Bytes) -> Array:
@@ -38,29 +21,6 @@ def to_bytes(colors: Array, is_linear: bool = True) -> Bytes:
     """Convert colours (..., 3) in [0, 1], of linear light or else sRGB, to sRGB bytes; others are clipped."""
     levels = linear_to_srgb(colors) if is_linear else colors
     return np.rint(np.clip(levels, 0.0, 1.0) * 255.0).astype(np.uint8)
-
-
-@functools.cache
-def palette() -> Bytes:
-    """Return RGB (NUM_COLORS, 3), each the colour of a grid farthest from all before it; none is black.
-
-    The loss is a norm in RGB: a label mistaken for another costs their distance.
-    """
-    levels = np.round(np.linspace(0.0, 255.0, NUM_LEVELS)).astype(np.int64)
-    grid = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(-1, 3)[1:]
-    colors = np.empty((NUM_COLORS, 3), dtype=np.uint8)
-    distance = np.full(len(grid), np.iinfo(np.int64).max)
-    farthest = len(grid) - 1  # white
-    for k in range(NUM_COLORS):
-        colors[k] = grid[farthest]
-        distance = np.minimum(distance, ((grid - grid[farthest]) ** 2).sum(axis=1))
-        farthest = int(distance.argmax())
-    return colors
-
-
-def label_colors(labels: Integers) -> Bytes:
-    """Return the colour (..., 3) of each label (...); labels equal modulo NUM_COLORS have the same colour."""
-    return np.asarray(palette()[labels % NUM_COLORS])
 
 
 def pack_rgbx(rgb: Bytes, is_valid: Mask | None = None) -> Int32s:

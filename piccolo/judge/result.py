@@ -148,10 +148,8 @@ class Result:
 
     @property
     def is_calibrated(self) -> bool:
-        """Return True if the probabilities are calibrated: not with labels or the preset paper."""
-        panorama: Any = self.settings.get("panorama", {})
-        is_rough = panorama.get("labels") or self.settings.get("preset") == "paper"
-        return self.probability_none is not None and not is_rough
+        """Return True if the probabilities are calibrated: not with the preset paper."""
+        return self.probability_none is not None and self.settings.get("preset") != "paper"
 
     @property
     def pose(self) -> Pose | None:

@@ -4,7 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..geometry.colors import Labels
 from ..judge.result import Result
 from ..photo.camera import Calibration
 from ..photo.panorama import Panorama, read_panorama
@@ -26,10 +25,4 @@ def read_as_localized(result: Result) -> Panorama:
     how: Any = result.settings.get("panorama") or {}
     nadir_deg = float(how.get("mask_nadir_deg") or 0.0)
     photo = replace(photo_of(result), mask=how.get("mask"), mask_nadir_deg=nadir_deg)
-    return read_panorama(photo, labels_of(result))
-
-
-def labels_of(result: Result) -> Labels | None:
-    """Return how the labels of a result's photo were read; None for colours."""
-    how: Any = result.settings.get("panorama") or {}
-    return Labels(tuple(how["labels"]["ignored"])) if how.get("labels") else None
+    return read_panorama(photo)

@@ -154,7 +154,7 @@ class Photo:
         if vector is not None and not (all(map(math.isfinite, vector)) and math.hypot(*vector) > 0.0):
             raise InputError(f"`gravity_vector`: found {vector}, wanted three finite numbers, not all 0")
 
-    def list_ways(self) -> list[str]:
+    def _list_ways(self) -> list[str]:
         """List the options that say what the picture shows, in backticks; at most one goes."""
         given = {
             "`camera` or `rig`": self.camera is not None or self.rig is not None,
@@ -168,7 +168,7 @@ class Photo:
 
     def _check_together(self) -> None:
         """Refuse options that give one thing twice, or belong to different pictures."""
-        ways = self.list_ways()
+        ways = self._list_ways()
         if len(ways) > 1:
             raise InputError(f"{', '.join(ways)}: wanted only one of them")
         if self.projection in ("fisheye", "cylindrical") and self.fov_deg is None:

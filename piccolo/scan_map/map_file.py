@@ -62,7 +62,6 @@ LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "sparse": ("<i8", ("sparse",)),
     "wide_features": ("|i1", ("sparse", 3 * WIDE_CELLS)),
     "wide_seen": ("|u1", ("sparse", WIDE_CELLS)),
-    "has_labels": ("|b1", ()),
     "has_shape": ("|b1", ()),
     "scan_sha256": ("<U64", ()),
     "crs": ("|u1", ("characters",)),  # UTF-8
@@ -78,7 +77,7 @@ FARTHEST_LAYERS = 0.2, 1.0  # [rad] and [m] about and along any axis
 MAX_CRS = 4 * 20_000  # [byte]
 MAX_WARNINGS = 1000  # lines
 MAX_WARNING = 5000  # characters of a line
-FORMAT = "piccolo-map/10"
+FORMAT = "piccolo-map/11"
 NAME = own_names("piccolo-map")  # in a cache
 OTHERS = ("octree", "scan_names", "warnings", "crs", "is_partial", "views", "places")
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
@@ -309,16 +308,13 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
             if remembers:
                 remember(what, archive.status, "")
         warnings = clean_warnings(path, arrays["warnings"])
-    own: dict[str, Any] = {
-        name: arrays[name] for name in ARRAYS if name not in ("has_labels", "has_shape", "scan_sha256")
-    }
+    own: dict[str, Any] = {name: arrays[name] for name in ARRAYS if name not in ("has_shape", "scan_sha256")}
     parts: dict[str, Any] = {name: arrays[f"octree_{name}"] for name in Octree._fields}
     octree = Octree(**{**parts, "leaf_size": float(arrays["octree_leaf_size"])})
     return ScanMap(
         octree=octree,
         views=CandidateViews(octree, arrays["centers"]),
         places=DrawnPlaces(octree, arrays["centers"]),
-        has_labels=bool(arrays["has_labels"]),
         has_shape=bool(arrays["has_shape"]),
         scan_names=tuple(map(str, arrays["scan_names"])),
         warnings=warnings,

@@ -55,13 +55,11 @@ def open_map(
     """
     map_path = find_prepared_map(paths)
     if map_path:
-        bare = replace(cloud_settings, labels=None, crs=None)
+        bare = replace(cloud_settings, crs=None)
         if len(paths) > 1 or bare not in (BY_FILE, replace(BY_FILE, scale=1.0)):
             raise InputError(f"{map_path}: found a prepared map, wanted it alone, without options for clouds")
         with watch.stage("read"):
-            scan_map = load_map(map_path, cache.is_used)
-        check_labels(map_path, scan_map, cloud_settings)
-        return scan_map
+            return load_map(map_path, cache.is_used)
 
     digest = ""
     if all(path.is_file() for path in paths):  # what is none is refused when it is opened
@@ -73,8 +71,7 @@ def open_map(
             cloud = open_cloud(paths, cloud_settings, workers.show)
         up = cloud_settings.up
         scan_map = prepare_map(cloud, workers, up, watch, prior=prior)
-        has_labels = cloud_settings.labels is not None
-        return replace(scan_map, has_labels=has_labels, scan_sha256=digest, crs=read_crs(paths))
+        return replace(scan_map, scan_sha256=digest, crs=read_crs(paths))
 
     key = content_key(digest, cloud_settings) if digest else ""
     if not (cache.is_used and key):
@@ -116,20 +113,12 @@ def extend_map(
         cloud = open_cloud(paths, replace(cloud_settings, channels=IN_COLORS.channels), workers.show)
         digest = sha256_of_files(paths)
         crs = read_crs(paths)
-    check_labels(map_path, old, cloud_settings)
     if crs and old.crs and crs != old.crs:
         workers.warn(f"{paths[0]}: names another coordinate system than the map; the map's is used")
     old = old if old.scan_names else name_scan(old, map_path.stem)
     both = "\n".join(sorted([old.scan_sha256, digest]))
     added = add_scan(old, cloud, name, workers, watch)
     return replace(added, scan_sha256=hashlib.sha256(both.encode()).hexdigest(), crs=old.crs or crs)
-
-
-def check_labels(map_path: Path, scan_map: ScanMap, cloud_settings: CloudSettings) -> None:
-    """Refuse a map of labels if colours are wanted, and the reverse."""
-    if scan_map.has_labels != (cloud_settings.labels is not None):
-        kind = "labels, wanted `labels` too" if scan_map.has_labels else "colours, wanted no `labels`"
-        raise InputError(f"{map_path}: found a prepared map of {kind}")
 
 
 def find_prepared_map(paths: Sequence[Path]) -> Path | None:

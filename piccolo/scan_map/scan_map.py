@@ -44,7 +44,6 @@ class ScanMap(MapFrame):
     wide_seen: Bytes  # (sparse, wide cells) fraction seen of each, 255 for all
     views: CandidateViews  # of fine cells, made when they are asked for; not in files
     places: DrawnPlaces  # positions with pictures of the scan, made when they are asked for; not in files
-    has_labels: bool = False  # colours are those of labels
     has_shape: bool = False  # colours are edges of the surfaces, of a scan without colours
     scan_names: tuple[str, ...] = ()  # of the scans put together; none if none was named
     warnings: tuple[str, ...] = ()

@@ -219,14 +219,6 @@ def run_scenes(
     return own, len(keys) - len(own)
 
 
-def select_labelled(arguments: Arguments, scene: Scene, queries: Sequence[Query]) -> list[Query]:
-    """Return the queries that have labels; say which have none."""
-    for query in queries:
-        if query.labels is None:
-            arguments.error(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
-    return [query for query in queries if query.labels]
-
-
 def localize_queries(
     arguments: Arguments,
     config: Localizer,
@@ -248,8 +240,6 @@ def localize_queries(
     if cluster:
         cluster.forget()  # a worker may not have room for the last scene's map and this one's
     localizer = replace(config, paths=(scene.cloud,))
-    if has_labels := localizer.cloud_settings.labels is not None:
-        queries = select_labelled(arguments, scene, queries)
     with ExitStack() as stack:
         num_jobs = execution.count_jobs(arguments, len(queries))
         place = execution.executing(arguments, localizer, num_jobs, cluster, open_scan)
@@ -258,7 +248,7 @@ def localize_queries(
         except Exception as error:
             arguments.error(f"{scene.name}: {describe_failure(error)}")
             return
-        tasks = (localizer.task((has_labels and q.labels) or q.image, q.calibration) for q in queries)
+        tasks = (localizer.task(q.image, q.calibration) for q in queries)
 
         def shown(values: Iterable[Any]) -> Iterator[Any]:
             return show(iter(values), len(queries), scene.name)

@@ -154,15 +154,14 @@ def match_results(
     InputError for a second result of a query.
     """
     pairs = [(scene, query) for scene in scenes for query in scene.queries]
-    queries = [(*pair, path) for pair in pairs for path in (pair[1].image, pair[1].labels) if path]
-    by_path = {path.resolve(): (scene, query) for scene, query, path in queries}
+    by_path = {query.image.resolve(): (scene, query) for scene, query in pairs}
     done: set[tuple[str, str]] = set()
     for result in results:
         found = by_path.get(Path(printable(result.pano)).resolve())  # queries have printable names
-        named = [(scene, query) for scene, query, path in queries if path.name == Path(result.pano).name]
+        named = [pair for pair in pairs if pair[1].image.name == Path(result.pano).name]
         named += frames_of_video(pairs, result.pano)
         if found is None and len(named) != 1:
-            names = sorted(path.name for _, _, path in queries)[:3]
+            names = sorted(query.image.name for _, query in pairs)[:3]
             text = f"{len(named)} queries of this name" if named else "a result without a true pose"
             tell(f"{result.pano}: found {text}, wanted one of {names} ...")
             continue

@@ -29,14 +29,13 @@ from piccolo.cli.command import (
 )
 from piccolo.cli.execution import check_execution
 from piccolo.cli.options import add_execution_options
-from piccolo.cloud.settings import IN_COLORS, CloudSettings
+from piccolo.cloud.settings import BY_FILE, IN_COLORS
 from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.writers import vertex_rows, writing_ply
-from piccolo.geometry.colors import Labels
 from piccolo.geometry.pose import Pose, move, rotation_from_quaternion_wxyz, transform_points
 from piccolo.photo.panorama import read_panorama
 from piccolo.scan_map.open_map import CachePolicy
-from piccolo.system.arrays import Array, Bytes
+from piccolo.system.arrays import Array, Bytes, Mask
 from piccolo.system.files.atomic import write_atomically
 from piccolo.system.jobs.memory import limit_memory
 
@@ -45,6 +44,7 @@ from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import statistics, table_of
 from ..scene import CLOUD_NAME, Query, Scene, find_scenes, input_files
 from ..synthetic.world import UPSIDE_DOWN
+from .labels import label_colors, read_labelled_points, read_labels
 from .photometric import PhotometricSettings
 
 # A transformed copy of a scene; the folder, which is there, is for its files alone.
@@ -80,7 +80,38 @@ def _write_cloud(folder: Path, points: Array, colors: Bytes) -> Path:
 
 
 def flip(scene: Scene, folder: Path) -> Scene:
-    """Every picture taken with the camera upside down: turned by half a turn about the view axis.
+    """Return every picture as if the camera was upside down: turned by half a turn about the view axis."""
+
+    def flip_one(query: Query) -> tuple[Bytes, Mask, Pose]:
+        panorama = read_panorama(query.image)
+        pose = Pose(UPSIDE_DOWN @ query.pose.R_cam_from_world, query.pose.center_world)
+        return panorama.rgb[::-1, ::-1], panorama.is_valid[::-1, ::-1], pose
+
+    return _with_pictures(scene, folder, flip_one)
+
+
+def show_labels(scene: Scene, folder: Path) -> Scene:
+    """Return the scene with labels in place of colours, in the cloud and in all pictures.
+
+    Each label has a colour of its own, which makes the method compare labels. The picture's pixels at the
+    poles are transparent, as no disc of a tripod is looked for there: a floor of one label looks like one.
+    """
+
+    def show_one(query: Query) -> tuple[Bytes, Mask, Pose]:
+        if query.labels is None:
+            raise InputError(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
+        rgb = label_colors(read_labels(query.labels))
+        is_valid = np.ones(rgb.shape[:2], np.bool_)
+        is_valid[[0, -1], 0] = False
+        return rgb, is_valid, query.pose
+
+    points, labels = read_labelled_points(scene.cloud)
+    labelled = _with_pictures(scene, folder, show_one)
+    return replace(labelled, cloud=_write_cloud(folder, points, label_colors(labels)))
+
+
+def _with_pictures(scene: Scene, folder: Path, change: Callable[[Query], tuple[Bytes, Mask, Pose]]) -> Scene:
+    """Return the scene with other pictures, of which `change` gives RGB, what counts, and the pose.
 
     They are PNG under the scene's own names, so that results of both can be compared by name.
     """
@@ -92,11 +123,9 @@ def flip(scene: Scene, folder: Path) -> Scene:
     for name, query in zip(names, scene.queries, strict=True):
         image = inner / name
         image.parent.mkdir(parents=True, exist_ok=True)
-        panorama = read_panorama(query.image)
-        bgra = cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2BGRA)
-        bgra[..., 3] = np.where(panorama.is_valid, 255, 0)  # transparent where it shows nothing
-        write_atomically(image, bytes(cv2.imencode(".png", bgra[::-1, ::-1])[1]))
-        pose = Pose(UPSIDE_DOWN @ query.pose.R_cam_from_world, query.pose.center_world)
+        rgb, is_valid, pose = change(query)
+        rgba = np.dstack([rgb, np.where(is_valid, 255, 0).astype(np.uint8)])  # transparent: shows nothing
+        write_atomically(image, bytes(cv2.imencode(".png", cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))[1]))
         queries.append(Query(image, query.variant, pose))
     return Scene(scene.name, inner, scene.cloud, tuple(queries))
 
@@ -116,7 +145,6 @@ class Condition(NamedTuple):
     settings: Settings
     transform: SceneTransform | None = None
     variants: tuple[str, ...] = ()  # the queries that it is about; empty for all
-    use_labels: bool = False
     paper: str = "-"  # what the paper has in this place
 
     @property
@@ -215,7 +243,7 @@ EXPERIMENTS = {
         "what is compared: colours or labels",
         {
             "RGB": {"paper": "0.03 m, 0.66 deg (Stanford2D-3D-S, all areas)"},
-            "labels": {"use_labels": True, "paper": "0.01 m, 0.28 deg (Stanford2D-3D-S, all areas)"},
+            "labels": {"transform": show_labels, "paper": "0.01 m, 0.28 deg (Stanford2D-3D-S, all areas)"},
         },
     ),
     "runtime": Experiment(
@@ -282,8 +310,6 @@ def run_condition(
     condition: Condition, scenes: Sequence[Scene], out: Path, arguments: Arguments
 ) -> tuple[list[QueryResult], int]:
     """Return the results under one condition, and how many queries could not be localized."""
-    labels = Labels() if condition.use_labels else None
-    cloud_settings = CloudSettings(labels=labels)
     transformed = []
     num_failed = 0
     with tempfile.TemporaryDirectory(prefix="piccolo-") as temporary:
@@ -296,7 +322,7 @@ def run_condition(
                 arguments.error(str(error))
                 num_failed += len(scene.queries)
         cache = CachePolicy(True, Path(temporary))
-        config = Localizer((), condition.settings, cloud_settings, Photo(Path()), cache)
+        config = Localizer((), condition.settings, BY_FILE, Photo(Path()), cache)
         variants = condition.variants or arguments.variants  # those of a condition are of the wanted
         path = out / file_name(condition)
         rows, num_failed_later = run_scenes(arguments, path, config, transformed, variants)

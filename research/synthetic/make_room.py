@@ -66,7 +66,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--camera FILE", text)
     option(parser, "--size X Y Z", "size of a room [m]", default=[6.0, 5.0, 2.7])
     option(parser, "--rooms N", "number of rooms, at most 256", default=1)
-    option(parser, "--labels", "also write semantic labels of points and pixels, for localize.py --labels")
+    option(parser, "--labels", "also write semantic labels of points and pixels, for reproduce_paper.py")
     text = "write N scenes, FOLDER/000 and so on, with consecutive seeds from --seed"
     option(parser, "--scenes N", text, default=0)
     group = parser.add_argument_group("buildings and walks")

@@ -27,7 +27,7 @@ from ...geometry.points import PackedPoints
 from ...geometry.pose import Pose, yaw_rotation
 from ...judge.probability import AMBIGUOUS
 from ...judge.result import Result
-from ...localization.result_photo import labels_of, photo_of
+from ...localization.result_photo import photo_of
 from ...photo.camera.model import pinhole
 from ...photo.panorama import Panorama, read_panorama
 from ...photo.panorama.model import shrink
@@ -91,7 +91,7 @@ def make_pictures(
 
     Spheres are at most `width` px wide, None for the photo's own size. Without a pose there is no scan.
     """
-    panorama = read_panorama(photo_of(result, photo), labels_of(result))
+    panorama = read_panorama(photo_of(result, photo))
     surfels, points = scan
     full = min(panorama.rgb.shape[1], width or MAX_SPHERE_PICTURE)
     small = shrink(panorama, full)

@@ -191,7 +191,7 @@ def _open(header: LasHeader, options: CloudSettings, channel: Channel) -> PointS
     """Return the points of a file in its unit."""
     path = header.path
     layout = read_laz_layout(header) if header.is_compressed else _plain_layout(header)
-    field = "class" if options.labels or channel == "shape" else {"colors": "rgb"}.get(channel, "intensity")
+    field = "class" if channel == "shape" else {"colors": "rgb"}.get(channel, "intensity")
     read = partial(_read, header, layout, field)
     if field == "class":
         return reader.make_source(path, read, channel, options, header.num_points)

@@ -145,15 +145,14 @@ def open_pcd(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "c
 
 
 def _select_fields(header: PcdHeader, options: CloudSettings, channel: Channel) -> tuple[PcdField, ...]:
-    """Return the fields x y z and one or three of colours, or the intensity or label, or no others."""
+    """Return the fields x y z and one or three of colours, or the intensity, or no others."""
     names = [field.name for field in header.fields]
     found = {field.name: field for field in header.fields if field.count == names.count(field.name) == 1}
-    chosen = reader.find_fields(found, channel, options.labels)
+    chosen = reader.find_fields(found, channel)
     if not chosen:
         listed = " ".join(names[:12]) or "none"
         error = MissingChannelError if {*"xyz"} <= found.keys() else InputError
-        wanted = "wanted x y z and label" if options.labels else WANTED
-        raise error(f"{header.path}: the fields are {quote_line(listed.encode())}, {wanted}")
+        raise error(f"{header.path}: the fields are {quote_line(listed.encode())}, {WANTED}")
     for name in chosen:
         if found[name].type == "f1" or (name in chosen[:3] and found[name].type[0] != "f"):
             wanted = "wanted float32 or float64" if name in chosen[:3] else "wanted numbers"

@@ -28,7 +28,6 @@ MAX_PLY_HEADER_SIZE = 1 << 20  # [byte]
 LINE_ENDS = (b"\r\n", b"\n", b"\r")
 ELEMENT_LINE = re.compile(rb"^(\s*element[ \t]+\S+[ \t]+)(\S+)[ \t]*$", re.MULTILINE)
 WANTED = "wanted a PLY file whose vertices have x y z and red green blue"
-LABELS_WANTED = "wanted x y z and a label (label, class or classification, or these after scalar_)"
 MAX_PLY_COUNT_DIGITS = 15
 MAX_VERTEX_SIZE = 1 << 24  # [byte] of a vertex with its lists
 OPACITY = "opacity"
@@ -67,8 +66,6 @@ def open_ply(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "c
     header = read_header(path)
     num_faces = sum(count for element, count in header.pairs if element.name == "face")
     if num_faces * MOST_STRAY > header.counts[header.index]:  # no cloud with a few stray faces
-        if options.labels:
-            raise InputError(f"{path}: found a mesh, wanted points with labels")
         return open_ply_mesh(path, options, channel)
     names = _property_names(header, options, channel)
     if not header.is_ascii and not _lists_before(header):
@@ -129,17 +126,16 @@ def read_header(path: Path) -> PlyHeader:
 
 
 def _property_names(header: PlyHeader, options: CloudSettings, channel: Channel) -> tuple[str, ...]:
-    """Return the vertices' properties for x, y, z and red, green, blue, or intensity, or label, or none."""
+    """Return the vertices' properties for x, y, z and red, green, blue, or intensity, or none."""
     properties = header.vertices.properties
     if header.is_ascii:  # of a line with lists only what is before them has its place
         properties = tuple(takewhile(lambda prop: not _is_list(prop), properties))
     found = [prop.name for prop in properties if not _is_list(prop)]
-    names = reader.find_fields(found, channel, options.labels)
+    names = reader.find_fields(found, channel)
     if not names:
         listed = " ".join(found[:9]) or "no properties before a list"
-        wanted = LABELS_WANTED if options.labels else WANTED
         error = MissingChannelError if reader.find_fields(found, "shape") else InputError
-        raise error(f"{header.path}: the vertices have {listed}, {wanted}")
+        raise error(f"{header.path}: the vertices have {listed}, {WANTED}")
     is_splat = names[3:6] == reader.SPLAT_NAMES and OPACITY in found
     return (*names, OPACITY) if is_splat else names
 

@@ -1,10 +1,9 @@
 """Parts of all readers: chunks of points as in a file, and points from columns of numbers.
 
 Columns are arrays (N,) of x, y, z and red, green, blue, or of x, y, z and a scalar. Colours of any type
-become 8 bits; `find_brightest` has the one rule for their range. Labels become colours in place of the file's
-own. Intensity becomes a gray. Its unit differs from scanner to scanner, and a few mirrors
-outshine everything: the 1st percentile of a file becomes black, its 99th white. These are percentiles of all
-points, in any order, for which the file is read once more.
+become 8 bits; `find_brightest` has the one rule for their range. Intensity becomes a gray. Its unit differs
+from scanner to scanner, and a few mirrors outshine everything: the 1st percentile of a file becomes black,
+its 99th white. These are percentiles of all points, in any order, for which the file is read once more.
 """
 
 import functools
@@ -17,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry.colors import Labels, label_colors
 from ...system.arrays import Array, Bytes, Floats, Mask
 from ...system.errors import InputError
 from ..settings import BY_FILE, RANGES, Channel, CloudSettings, UpAxis
@@ -58,9 +56,6 @@ NUM_LEVEL_BINS = 1 << 16
 NUM_COLORED = 6  # columns x y z red green blue
 SPLAT_FACTOR = 0.28209479177387814  # of the constant spherical harmonic, 1 / (2 sqrt(pi))
 GRAY = 128  # of points of which only the shape counts
-# as in PLY files, in lower case; the first that is found counts. CloudCompare prefixes `scalar_`
-LABEL_NAMES = ("label", "scalar_label", "class", "scalar_class", "classification", "scalar_classification")
-MOST_LABEL = 2.0**32  # labels are below it, and above its negative
 
 
 class MissingChannelError(InputError):
@@ -102,8 +97,8 @@ def point_label(path: Path, index: int) -> str:
     return f"{path}: point {index + 1}"
 
 
-def find_fields(names: Collection[str], channel: Channel, labels: Labels | None = None) -> tuple[str, ...]:
-    """Return x y z and the colours, intensity or label among a file's names; empty if any is missing.
+def find_fields(names: Collection[str], channel: Channel) -> tuple[str, ...]:
+    """Return x y z and the colours or intensity among a file's names; empty if any is missing.
 
     Capitals don't count.
     """
@@ -113,10 +108,9 @@ def find_fields(names: Collection[str], channel: Channel, labels: Labels | None 
         "intensity": [(name,) for name in INTENSITY_NAMES],
         "shape": [()],
     }
-    kinds = [(name,) for name in LABEL_NAMES] if labels else wanted[channel]
     places, more = (
         next((some for some in choices if by_lower.keys() >= set(some)), None)
-        for choices in (POINT_NAMES, kinds)
+        for choices in (POINT_NAMES, wanted[channel])
     )
     return () if places is None or more is None else tuple(by_lower[name] for name in (*places, *more))
 
@@ -225,12 +219,10 @@ def make_source(
     num_points: int | None = None,
     types: Sequence[str] = (),
 ) -> PointSource:
-    """Return the points that `read` yields with colours, or with a label, else an intensity.
+    """Return the points that `read` yields with colours, else an intensity.
 
     Colours are bytes, unless they are of other `types`. If only the shape counts, the points are grey.
     """
-    if settings.labels:
-        return PointSource(path, partial(_read_labels, path, read, settings.labels), num_points)
     if types and channel == "colors":
         usual = USUAL.get(types[0], BYTE_RANGE) if len({*types}) == 1 else BYTE_RANGE
         samples: list[Part] | None = [] if {*types} == {"u1"} else None
@@ -355,15 +347,3 @@ def _limits(chunks: Iterator[Part]) -> tuple[float, float]:
         order[np.searchsorted(total, np.array([DARK_SHARE, BRIGHT_SHARE]) * total[-1])]
     ].tolist()
     return low, high
-
-
-def _read_labels(path: Path, read: PartReader, labels: Labels) -> Iterator[RawCloud]:
-    """Yield the points whose label counts, in the label's colour."""
-    for points, found in read():
-        values = np.where(np.isfinite(points).all(axis=1), found, 0.0)  # the others are left out later
-        is_whole = (np.abs(values) < MOST_LABEL) & (values == np.floor(values))
-        if not is_whole.all():
-            raise InputError(f"{path}: found the label {values[np.argmin(is_whole)]:g}, wanted whole numbers")
-        numbers = values.astype(np.int64)
-        is_kept = labels.are_kept(numbers)
-        yield RawCloud(points[is_kept], label_colors(numbers[is_kept]))

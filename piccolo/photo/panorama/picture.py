@@ -24,7 +24,6 @@ from PIL.PngImagePlugin import PngImageFile
 from PIL.TiffImagePlugin import TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
-from ...geometry.colors import Labels, label_colors
 from ...system.arrays import Bytes, Mask
 from ...system.errors import InputError, ResourceError, import_optional
 from ...system.files.json_file import read_bytes
@@ -73,7 +72,6 @@ SUBFILE_TYPE = 254
 REDUCED = 1
 WHITE_IS_ZERO = 0
 UNSIGNED = 1
-LABEL_KINDS = (b"\x08\x00", b"\x10\x00", b"\x08\x02")  # in a PNG's header: grey of 8 and 16 bits, RGB of 8
 END_MARK = b"\xff\xd9"  # of a JPEG
 # libtiff writes what it finds damaged to stderr, which belongs to the whole process
 DECODE_TIFF = """\
@@ -133,24 +131,6 @@ def read_picture(path: Path, min_size: tuple[int, int] = (MIN_PICTURE_WIDTH, MIN
             exif=read_exif(image),
             orientation=_orientation(image),
         )
-
-
-def read_labels(path: Path, labels: Labels) -> Picture:
-    """Return the picture in a PNG file of labels, in their colours; of RGB, a label is R 65536 + G 256 + B.
-
-    Raises InputError if the file is missing or damaged, its size is out of range, or it is of no kind that
-    keeps labels.
-    """
-    data = read_bytes(path, WANTED)
-    with open_picture(path, data) as image:
-        _check(path, image, len(data), (MIN_PICTURE_WIDTH, MIN_PICTURE_HEIGHT))
-        if image.format != "PNG" or data[24:26] not in LABEL_KINDS or image.has_transparency_data:
-            wanted = "wanted a PNG, grey of 8 or 16 bits or RGB of 8, without alpha"
-            raise InputError(f"{path}: this kind of picture holds no labels, {wanted}")
-        pixels = np.array(_decode(path, data, image, image.mode)).astype(np.int32)
-        if pixels.ndim == 3:
-            pixels = pixels[..., 0] << 16 | pixels[..., 1] << 8 | pixels[..., 2]
-        return Picture(label_colors(pixels), labels.are_kept(pixels), _xmp(image), _warnings(image))
 
 
 def picture_shape(path: Path) -> tuple[tuple[int, int], object]:

@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ...geometry.colors import Labels
 from ...system.arrays import Bytes, Mask
 from ...system.errors import InputError
 from ...system.jobs.memory import check_memory
@@ -22,7 +21,7 @@ from .facts import elevation_deg
 from .gpano import ASPECT_TOLERANCE, CropRegion
 from .masks import black_borders, find_mask, is_dual_fisheye, mask_pole, polar_disc, read_mask, shows_twice
 from .model import FocalPrior, GPano, Panorama
-from .picture import PICTURE_BYTES_PER_PIXEL, Picture, picture_shape, read_labels, read_picture
+from .picture import PICTURE_BYTES_PER_PIXEL, Picture, picture_shape, read_picture
 
 Shot = tuple[Path, Picture, tuple[Mount, ...]]  # a file with the cameras that took it
 PHOTO_FOV_DEG = 65, 50  # of a phone's main camera, 24 to 28 mm on film: 63 to 72 wide, upright 50 to 57
@@ -40,36 +39,27 @@ NO_HORIZON = "the metadata call the crop's height the sphere's: its horizon is a
 MIN_REPORTED_SHARE = 0.001  # of the sphere: borders below this are masked without a warning
 
 
-def read_panorama(photo: File | Bytes | Photo, labels: Labels | None = None) -> Panorama:
+def read_panorama(photo: File | Bytes | Photo) -> Panorama:
     """Return the full sphere of a picture file, a folder of six cube faces or an array.
 
     Colours have 8 bits (of 16 the upper 8, v >> 8), grey becomes RGB, EXIF's orientation is applied. Not
-    valid are pixels of alpha 0, outside a crop, masked, in black borders and in discs over a pole. Labels
-    become colours, and only masks and ignored labels are not valid. Of an array only masked pixels are not.
+    valid are pixels of alpha 0, outside a crop, masked, in black borders and in discs over a pole. Of
+    an array only masked pixels are not.
 
     InputError if the file is missing or damaged, of another format or projection, its size is out of range,
     or the part of the sphere that it shows is unknown.
     """
     photo = as_photo(photo)
-    panorama = _read(photo, labels)
+    panorama = _read(photo)
     if photo.gravity_vector is None:
         return panorama
     return replace(panorama, gpano=gpano.attitude_of_gravity(photo.gravity_vector))
 
 
-def check_labels(photo: Photo, labels: Labels | None) -> None:
-    """Refuse a photo that does not show the full sphere where labels are compared."""
-    if labels and (ways := photo.list_ways()):
-        raise InputError(f"`labels`: found {ways[0]} too, wanted a picture of the full sphere")
-
-
-def _read(photo: Photo, labels: Labels | None) -> Panorama:
+def _read(photo: Photo) -> Panorama:
     """Read a photo; its attitude is that of the file."""
-    check_labels(photo, labels)
     if isinstance(photo.picture, np.ndarray):
         return _read_array(photo, photo.picture)
-    if labels:
-        return _read_labelled(photo, labels)
     if photo.instant is not None:
         return _read_rig(photo, photo.instant)
     if photo.path.is_dir():
@@ -171,20 +161,6 @@ def panorama_size(path: Path) -> tuple[int, int]:
     return size
 
 
-def _read_labelled(photo: Photo, labels: Labels) -> Panorama:
-    """Read the panorama in a PNG of labels. No automatic masks: a black border is a label too."""
-    path = photo.path
-    picture = read_labels(path, labels)
-    width, height = picture.size
-    if width != 2 * height:
-        raise InputError(f"{path}: found labels of {width} x {height}, wanted the full sphere, W = 2 H")
-    notes = list(picture.warnings)
-    counts = _user_masks(path, [picture.size], photo, notes).get(0)
-    fields = gpano.gpano_fields(picture.xmp)
-    attitude = gpano.attitude(fields) if fields else None
-    return _mask(photo, Panorama(picture.rgb, picture.is_valid, attitude, tuple(notes)), counts)
-
-
 def _region_of(photo: Photo, picture: Picture, fields: dict[str, str]) -> tuple[CropRegion, list[str]]:
     """Return the part of the sphere that a picture shows, by the user or metadata, and warnings."""
     width, height = picture.size
@@ -265,7 +241,7 @@ def _mask(photo: Photo, panorama: Panorama, counts: Mask | None) -> Panorama:
     is_valid = panorama.is_valid if counts is None else panorama.is_valid & counts
     is_valid = mask_pole(is_valid, "nadir", photo.mask_nadir_deg)
     if not is_valid.any():
-        raise InputError(f"{photo.path}: no pixel is left: all are masked, black, or of ignored labels")
+        raise InputError(f"{photo.path}: no pixel is left: all are masked or black")
     return replace(panorama, is_valid=np.ascontiguousarray(is_valid))
 
 
