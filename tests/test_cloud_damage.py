@@ -1,7 +1,6 @@
 """Files of points and meshes that are damaged, cut off or hostile: read, or refused in one line."""
 
 import io
-import json
 import struct
 import sys
 import zlib
@@ -12,7 +11,7 @@ import pytest
 from clouds import read, whole
 from hypothesis import given, settings, strategies as st
 from las_files import RAW, las_bytes, laz_bytes
-from meshes import CORNER_COLORS, SQUARE, Gltf, change, obj_text, textured_gltf, write_obj, write_ply
+from meshes import CORNER_COLORS, SQUARE, Gltf, obj_text, textured_gltf, write_obj, write_ply
 from pcd_files import COLORS, ENCODINGS, content_of
 from ply_files import vertices
 from plyfile import PlyData
@@ -20,7 +19,6 @@ from refusals import assert_input_error, assert_refused, mutated, read_or_refuse
 from scans import read_cloud
 from text_files import TWO_SCANS, lines_of, pts
 
-from piccolo.cloud.readers import mesh_files
 from piccolo.cloud.readers.mesh import open_mesh
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.stream import open_cloud, open_source
@@ -89,46 +87,35 @@ def refusal(path, read=read_cloud):
     return message
 
 
-ELSEWHERE = ["../wall.png", "/etc/hostname", "https://example.com/wall.png", "file:///etc/hostname"]
-
-
-@pytest.mark.parametrize("name", [*ELSEWHERE, "..\\wall.png", "C:\\wall.png", "gone.png", "a" * 5000])
-def test_references_are_held_to_the_folder(tmp_path, name):
-    folder = tmp_path / "mesh"
-    folder.mkdir()
-    (tmp_path / "wall.png").write_bytes(made.png())
+@pytest.mark.parametrize("name", ["gone.png", "../gone.png", "a" * 5000])
+def test_missing_files_are_named(tmp_path, name):
     gltf = made.textured_gltf()
     gltf.tree["images"] = [{"uri": name}]
-    obj = open_source(made.write_obj(folder, mtl=f"newmtl wall\nmap_Kd {name}\n"))
-    if name in ("https://example.com/wall.png", "C:\\wall.png"):  # the one of that name beside it
-        assert (obj.channel, obj.warnings) == ("colors", ())
-        return
-    assert obj.channel == "shape"
-    assert f"names the file {name[:100]!a}" in obj.warnings[0]
     paths = [
-        gltf.glb(folder / "a.glb"),
-        made.textured_gltf().gltf(folder / "a.gltf", name, is_written=False),
+        gltf.glb(tmp_path / "a.glb"),
+        made.textured_gltf().gltf(tmp_path / "a.gltf", name, is_written=False),
         made.write_ply(
-            folder / "a.ply", uv=made.UV_FROM_BELOW, options={"comments": [f"TextureFile {name}"]}
+            tmp_path / "a.ply", uv=made.UV_FROM_BELOW, options={"comments": [f"TextureFile {name}"]}
         ),
     ]
     for path in paths:
         assert f"names the file {name[:100]!a}" in refusal(path)
-
-
-def test_a_link_out_of_the_folder_is_refused_and_missing_materials_are_named(tmp_path):
-    folder = tmp_path / "mesh"
-    folder.mkdir()
-    path = made.write_obj(folder)
-    (folder / "wall.png").rename(tmp_path / "wall.png")
-    (folder / "wall.png").symlink_to(tmp_path / "wall.png")
-    wanted = "names the file 'wall.png', wanted names in the mesh's own folder or below"
-    assert wanted in open_source(path).warnings[0]
+    obj = open_source(made.write_obj(tmp_path, mtl=f"newmtl wall\nmap_Kd {name}\n"))
+    assert obj.channel == "shape"
+    assert f"names the file {name[:100]!a}" in obj.warnings[0]
+    (tmp_path / "room.mtl").unlink()
     bare = open_source(made.write_obj(tmp_path, mtl=""))
     assert "names the file 'room.mtl', which is not in its" in bare.warnings[0]
 
 
-NAMES = ["C:\\scans\\wall.png", "/home/me/wall.png", "WALL.PNG", "-s 1 1 1 wall.png", "-clamp on wall.png"]
+NAMES = [
+    "C:\\scans\\wall.png",
+    "https://example.com/wall.png",
+    "/home/me/wall.png",
+    "WALL.PNG",
+    "-s 1 1 1 wall.png",
+    "-clamp on wall.png",
+]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -228,7 +215,6 @@ BASE = ("materials", 0, "pbrMetallicRoughness")
         (("bufferViews", 1, "byteStride"), 0),
         (("bufferViews", 0, "buffer"), 7),
         (("nodes", 0, "children"), [0]),
-        (("scenes", 0, "nodes"), [0, 0]),
         (("scenes", 0, "nodes"), []),
         (("nodes", 0, "mesh"), 3),
         (("nodes", 0, "scale"), [0, 0, 0]),
@@ -239,7 +225,6 @@ BASE = ("materials", 0, "pbrMetallicRoughness")
         ((*BASE, "baseColorTexture", "index"), 4),
         ((*BASE, "baseColorTexture", "extensions"), {"KHR_texture_transform": {}}),
         (("materials", 0, "extensions"), {"KHR_materials_pbrSpecularGlossiness": {}}),
-        ((*BASE, "baseColorFactor"), [2, 0, 0, 1]),
         (("extensionsRequired",), ["KHR_draco_mesh_compression"]),
         (("asset", "version"), "1.0"),
         (("asset",), None),
@@ -253,48 +238,10 @@ def test_broken_gltf_is_refused(tmp_path, path, value):
     assert path != ("extensionsRequired",) or f"requires the extensions {value[0]!r}, wanted" in message
 
 
-def test_gltf_with_wrong_indices_or_colors_says_so(tmp_path):
+def test_gltf_with_wrong_indices_says_so(tmp_path):
     gltf = made.Gltf()
     gltf.node(mesh=gltf.mesh(triangles=made.TRIANGLES + 2, colors=made.CORNER_COLORS, uv=None))
     assert "a face names vertex 5 " in refusal(gltf.glb(tmp_path / "a.glb"))
-    gltf = made.Gltf()
-    gltf.node(mesh=gltf.mesh(uv=None, colors=np.eye(3, dtype=np.float32)))
-    assert "a primitive with [3, 4] rows" in refusal(gltf.glb(tmp_path / "a.glb"))
-
-
-@pytest.mark.parametrize("kind", ["bufferViews", "accessors"])
-def test_data_that_are_promised_many_times_are_refused(tmp_path, kind):
-    gltf = made.textured_gltf()
-    view = gltf.view(bytes(10_000))
-    entry = {
-        "bufferViews": {"buffer": 0, "byteLength": 10_000},
-        "accessors": {"bufferView": view, "componentType": 5121, "type": "SCALAR", "count": 10_000},
-    }[kind]
-    gltf.tree[kind] += [entry] * 5000
-    assert "bytes of data promised in" in refusal(gltf.glb(tmp_path / "a.glb"))
-
-
-def test_data_that_primitives_share_without_end_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(mesh_files, "MAX_ROWS", 9999)
-    gltf = made.Gltf()
-    uv = np.tile(made.UV_FROM_ABOVE, (500, 1))
-    gltf.node(mesh=gltf.mesh(np.tile(made.SQUARE, (500, 1)), uv, material=gltf.material(made.png())))
-    [primitive] = gltf.tree["meshes"][0]["primitives"]
-    gltf.tree["meshes"][0]["primitives"] = 10 * [primitive]  # as some exporters do
-    assert open_mesh(gltf.glb(tmp_path / "a.glb")).num_points == 100_000
-    gltf.tree["meshes"][0]["primitives"] = 1000 * [primitive]
-    assert "over 9999 vertices and indices in" in refusal(gltf.glb(tmp_path / "a.glb"))
-
-
-def test_deep_json_and_deep_nodes_are_refused(tmp_path):
-    path = tmp_path / "a.gltf"
-    path.write_text("[" * 200_000)
-    assert "broken JSON" in refusal(path)
-    gltf = made.textured_gltf()
-    for i in range(300):
-        gltf.node(is_root=False, children=[i])
-    gltf.tree["scenes"][0]["nodes"] = [300]
-    assert "over 200 nodes below each other" in refusal(gltf.glb(path))
 
 
 @pytest.mark.parametrize("size", [4, 15, 30, 300, -1, -500])
@@ -352,21 +299,3 @@ def test_mutated_meshes_raise_nothing_but_input_error(name, data, tmp_path_facto
     path.write_bytes(mutated(data.draw, st.integers, path.read_bytes()))
     cloud, message = read_or_refused(read_cloud, path)
     assert message or len(cloud.points) >= 1000
-
-
-def test_one_changed_number_of_the_json(tmp_path):
-
-    def entries(part, path=()):
-        for key, entry in list(part.items() if isinstance(part, dict) else enumerate(part)):
-            yield (*path, key)
-            if isinstance(entry, dict | list):
-                yield from entries(entry, (*path, key))
-
-    refusals = 0
-    for way in entries(json.loads(json.dumps(textured_gltf().tree))):
-        for value in (None, -1, 3, 10**20, 1.5, "x", [], {}, [[0]], True):
-            gltf = textured_gltf()
-            change(way, value)(gltf.tree)
-            _, message = read_or_refused(open_mesh, gltf.glb(tmp_path / "a.glb"))
-            refusals += bool(message)
-    assert refusals > 200

@@ -8,7 +8,7 @@ from refusals import assert_refused
 from scans import read_cloud
 from scipy.spatial.transform import Rotation
 
-from piccolo.cloud.readers import mesh as mesh_module, mesh_files
+from piccolo.cloud.readers import mesh as mesh_module, mesh_loading
 from piccolo.cloud.readers.mesh import compute_weights, look_up, open_mesh
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.settings import CloudSettings
@@ -350,9 +350,9 @@ def test_a_textured_material_without_uv_is_left_out_whatever_its_color(tmp_path)
 
 
 def test_a_texture_of_many_surfaces_is_decoded_once(tmp_path, monkeypatch):
-    decode = mesh_files.Texture.texels
+    decode = mesh_loading.Texture.texels
     calls = []
-    monkeypatch.setattr(mesh_files.Texture, "texels", lambda self: calls.append(self) or decode(self))
+    monkeypatch.setattr(mesh_loading.Texture, "texels", lambda self: calls.append(self) or decode(self))
     gltf = made.Gltf()
     pictures = made.QUADRANTS, made.QUADRANTS[::-1].copy()
     first, other = (gltf.material(made.png(pixels)) for pixels in pictures)

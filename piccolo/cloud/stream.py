@@ -20,7 +20,7 @@ from ..system.files.cache import sha256_of_arrays
 from ..system.jobs.memory import check_address_space
 from ..system.jobs.threads import Progress, Workers, no_progress
 from .point_validator import Chunk, PointValidator, find_box
-from .readers import e57, e57_file, las, las_file, mesh, mesh_files, npz, pcd, ply, reader, text
+from .readers import e57, e57_file, gltf, las, las_file, mesh, npz, pcd, ply, reader, text
 from .settings import BY_FILE, Channel, CloudSettings, UpAxis
 from .voxels import Voxels, VoxelTable, morton_order
 
@@ -223,7 +223,7 @@ FORMATS = (
     CloudFormat("NumPy .npz", (".npz",), npz.has_npz_magic, npz.open_npz),
     CloudFormat("NumPy .npy", (".npy",), _begins(npz.NPY_MAGIC), npz.open_npy, has_columns=True),
     CloudFormat(
-        "OBJ, GLB and glTF meshes", (".obj", ".glb", ".gltf"), _begins(mesh_files.GLB_MAGIC), mesh.open_mesh
+        "OBJ, GLB and glTF meshes", (".obj", ".glb", ".gltf"), _begins(gltf.GLB_MAGIC), mesh.open_mesh
     ),
     CloudFormat(
         "text x y z r g b",

@@ -1,7 +1,7 @@
 """Textured and coloured meshes as point clouds: OBJ, glTF, GLB, and PLY files with faces.
 
 Coordinates are those of the file, after its own scene graph: a glTF file's y stays y, in its unit. trimesh
-reads the files; faults that it would ignore silently are checked before and after.
+reads the files.
 
 Point k of N lies at the fraction (k + 1/2) / N of the cumulative area of the triangles, so that the number of
 points in a triangle is proportional to its area within one. Its position in the triangle is the k-th point of
@@ -22,8 +22,8 @@ from ...geometry.pose import transform_points
 from ...system.arrays import Array, Bytes, Int64s, Mask
 from ...system.errors import InputError
 from ..settings import BY_FILE, Channel, CloudSettings, UpAxis
-from .mesh_files import GLB_MAGIC, Texture
-from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
+from .gltf import GLB_MAGIC
+from .mesh_loading import WANTED, Loaded, Texture, load_gltf, load_obj, load_ply
 from .reader import (
     GRAY,
     POINTS_A_CHUNK,
@@ -204,20 +204,13 @@ def _sample(loaded: Loaded, is_bare: bool) -> PointSource:
     return PointSource(path, read_chunks, num_points, tuple(notes))
 
 
-def _nodes(loaded: Loaded) -> list[tuple[Array, str]]:
-    """Return the matrices (4, 4) with which the scene places its parts, and these parts' names."""
-    nodes = [loaded.scene.graph.get(node) for node in loaded.scene.graph.nodes_geometry]
-    # not by the nodes' names: trimesh makes some up by chance
-    return sorted(nodes, key=lambda node: (node[1], node[0].tobytes()))
-
-
 def _clouds(loaded: Loaded, is_bare: bool) -> list[RawCloud]:
     """Return the points of a file that has no triangles, where the scene places them."""
-    parts = loaded.scene.geometry
+    parts = loaded.parts
     if any(hasattr(part, "faces") for part in parts.values()):
         return []
     clouds = []
-    for matrix, name in _nodes(loaded):
+    for matrix, name in loaded.nodes:
         vertices = np.array(parts[name].vertices, np.float64)
         if vertices.shape[1:] != (3,):
             raise InputError(f"{loaded.path}: vertices of shape {vertices.shape}, wanted three numbers each")
@@ -234,13 +227,12 @@ def _clouds(loaded: Loaded, is_bare: bool) -> list[RawCloud]:
 
 def _surfaces(loaded: Loaded, is_bare: bool) -> tuple[list[Surface], list[str]]:
     """Return the coloured surfaces where the scene places them, and warnings; bare, all without colours."""
-    scene = loaded.scene
     path = loaded.path
-    meshes = {name: mesh for name, mesh in scene.geometry.items() if hasattr(mesh, "faces")}
+    meshes = {name: mesh for name, mesh in loaded.parts.items() if hasattr(mesh, "faces")}
     by_name = {name: _surface(loaded, mesh) for name, mesh in meshes.items()}
     surfaces = []
     num_bare = 0
-    for matrix, name in _nodes(loaded):
+    for matrix, name in loaded.nodes:
         surface = by_name.get(name)
         if surface is None:
             continue

@@ -1,21 +1,23 @@
-"""Meshes read by trimesh, with checks, before and after, of faults that it ignores silently."""
+"""Meshes read by trimesh, with the files that they name, and checks of faults that it ignores silently."""
 
 import logging
 import re
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
 from itertools import product
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PureWindowsPath
+from typing import Any, NamedTuple
 
 import numpy as np
+from PIL import Image
 
-from ...system.arrays import Array
+from ...system.arrays import Array, Bytes
 from ...system.errors import InputError, import_optional
 from ..settings import BY_FILE, CloudSettings
-from . import mesh_files
-from .mesh_files import GLB_MAGIC, NO_MATERIAL, FolderResolver, Material, Texture
+from .gltf import GLB_MAGIC, NO_MATERIAL, Material, prepare_gltf
 
 WANTED = "wanted a mesh with textures, vertex colours or materials"
 # faces whose indices count back from the last vertex, or are 0; trimesh would take wrong vertices
@@ -29,7 +31,12 @@ ODD_STARTS = (
 )
 LIBRARY_LINE = re.compile(rb"^[ \t]*mtllib[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
 TEXTURE_LINE = re.compile(r"^[ \t]*map_Kd[ \t]+(.*?)[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
+# of a map in a material library, before the name of its file
+MAP_OPTIONS = re.compile(r"^(?:-\w+(?:\s+(?:-?[\d.]+|on|off|[a-z]))*\s+)+", re.IGNORECASE)
 TEXTURE_COMMENT = re.compile(r"TextureFile[ \t]*(.*?)[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
+MAX_TEXELS = 1 << 28  # 16,384 x 16,384: 1 GiB while it is looked up, three while it is decoded
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA", "GIF")
+MODES = frozenset({"1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr"})  # 8 bits a channel or less
 
 # Once, here: the filters are of the process, and no thread may change them.
 # NumPy before 2.3 only warned where it stopped at what is no number.
@@ -38,12 +45,111 @@ logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else Python pr
 warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
 
 
+class Texture(NamedTuple):
+    """An image, still encoded: textures are decoded one at a time."""
+
+    path: Path  # of the mesh
+    content: bytes
+
+    def texels(self) -> Bytes:
+        """Decode the texels (H, W, 4) RGBA, the first row at the top."""
+        with open_image(self.path, self.content) as image:
+            return np.asarray(image.convert("RGBA"))
+
+
+@contextmanager
+def own_limit() -> Iterator[None]:
+    """Lift Pillow's limit, which real textures exceed: MAX_TEXELS is held here before they are decoded."""
+    limit = Image.MAX_IMAGE_PIXELS
+    Image.MAX_IMAGE_PIXELS = None
+    try:
+        yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
+
+
+@contextmanager
+def open_image(path: Path, content: bytes, name: str = "") -> Iterator[Image.Image]:
+    """Yield an image of an allowed size; InputError if it can't be opened, or decoded by the caller."""
+    with own_limit():
+        try:
+            with Image.open(BytesIO(content), formats=FORMATS) as image:
+                check_image(path, image)
+                yield image
+        except (InputError, MemoryError):
+            raise
+        except Exception as error:  # Pillow's decoders raise whatever their formats bring
+            raise InputError(f"{path}: the texture{name} can't be read ({first_line(error)})") from error
+
+
+def check_image(path: Path, image: Image.Image) -> None:
+    """Refuse a texture that is too large, or of more than 8 bits."""
+    width, height = image.size
+    if width * height > MAX_TEXELS:
+        raise InputError(f"{path}: a texture of {width} x {height} texels, wanted at most {MAX_TEXELS}")
+    if image.mode not in MODES:
+        raise InputError(f"{path}: a texture of mode {image.mode}, wanted 8 bits a channel")
+
+
+def first_line(error: BaseException) -> str:
+    """Return the type of an error and the beginning of its message."""
+    text = (str(error).splitlines() or [""])[0]
+    return f"{type(error).__name__}: {text[:100]!a}" if text else type(error).__name__
+
+
+@dataclass
+class FileFinder:
+    """The files that a mesh names; a resolver for trimesh.
+
+    trimesh continues without a file that it can't get, so the last refusal is kept for later.
+    """
+
+    path: Path  # the mesh
+    is_lenient: bool = False  # a missing file costs its colours only
+    refusal: InputError | None = None
+    notes: dict[str, None] = field(default_factory=dict)  # of missing files, in order
+
+    def get(self, name: str) -> bytes:
+        """Return the content of a file by the name that the mesh gives it, or else of the one beside it.
+
+        Of its name, capitals don't count then.
+        """
+        folder = self.path.parent
+        name = MAP_OPTIONS.sub("", name.strip()).strip()
+        last = PureWindowsPath(name).name.lower()  # names may be written on Windows
+        try:
+            beside = [entry for entry in folder.iterdir() if entry.name.lower() == last]
+            files = [folder / name.replace("\\", "/"), *(beside if len(beside) == 1 else [])]
+            return next(file for file in files if file.is_file()).read_bytes()
+        except (OSError, ValueError, StopIteration) as error:
+            why = ", which is not in its folder" if isinstance(error, StopIteration) else f" ({error})"
+            refusal = InputError(f"{self.path}: names the file {name[:100]!a}{why}")
+            self.refusal = None if self.is_lenient else refusal
+            self.notes[f"{refusal}; its colours are missing"] = None
+            raise refusal from error
+
+    __getitem__ = get
+
+    @contextmanager
+    def noting(self) -> Iterator[None]:
+        """Within this, a missing file ends the block, with a note, if that costs colours only."""
+        num_notes = len(self.notes)
+        try:
+            yield
+        except InputError:
+            if not self.is_lenient or len(self.notes) == num_notes:
+                raise
+
+
 @dataclass(frozen=True)
 class Loaded:
     """A file as trimesh loaded it."""
 
     path: Path
-    scene: Any  # trimesh.Scene
+    parts: dict[str, Any]  # meshes and points of trimesh, by name
+    nodes: list[
+        tuple[Array, str]
+    ]  # matrices (4, 4) with which the scene places parts, and these parts' names
     materials: list[Material] | None = None  # of glTF, named by their rows
     textures: dict[int, Texture | None] = field(default_factory=dict)  # by their images' identity
     settings: CloudSettings = BY_FILE
@@ -70,16 +176,20 @@ class Loaded:
     def _texture(self, image: Any) -> Texture | None:
         """Return the texture in an image, one object for all surfaces that share it."""
         if id(image) not in self.textures:
-            self.textures[id(image)] = mesh_files.read_texture(self.path, image)
+            file = getattr(image, "fp", None)  # trimesh has a placeholder for a missing image
+            if file is not None:
+                check_image(self.path, image)
+                file.seek(0)
+            self.textures[id(image)] = None if file is None else Texture(self.path, file.read())
         return self.textures[id(image)]
 
 
 def load_gltf(path: Path, content: bytes) -> Loaded:
     """Load a glTF or GLB file."""
-    resolver = FolderResolver(path)
-    sanitized, materials = mesh_files.sanitize_gltf(content, resolver)
+    finder = FileFinder(path)
+    prepared, materials = prepare_gltf(path, content, finder.get)
     kind = "glb" if content.startswith(GLB_MAGIC) else "gltf"
-    return Loaded(path, _scene(resolver, sanitized, kind), materials)
+    return Loaded(path, *_load(finder, prepared, kind), materials)
 
 
 def load_obj(path: Path, content: bytes) -> Loaded:
@@ -94,21 +204,21 @@ def load_obj(path: Path, content: bytes) -> Loaded:
     odd = ODD_FACE.search(content)
     if odd:
         raise InputError(f"{path}: a face {odd[0][:40].decode('latin-1')!a}, wanted indices from 1 upwards")
-    resolver = FolderResolver(path, is_lenient=True)
+    finder = FileFinder(path, is_lenient=True)
     names = set(LIBRARY_LINE.findall(content))
     if len(names) > 1:
         raise InputError(f"{path}: names {len(names)} files of materials, wanted one")
     for name in names:
-        with resolver.noting():
-            text = resolver.get(name.decode()).decode("utf-8", "replace")
-            _check_textures(resolver, TEXTURE_LINE.findall(text))
-    return Loaded(path, _scene(resolver, content, "obj"), notes=resolver.notes)
+        with finder.noting():
+            text = finder.get(name.decode()).decode("utf-8", "replace")
+            _check_textures(finder, TEXTURE_LINE.findall(text))
+    return Loaded(path, *_load(finder, content, "obj"), notes=finder.notes)
 
 
-def _check_textures(resolver: FolderResolver, names: list[str]) -> None:
+def _check_textures(finder: FileFinder, names: list[str]) -> None:
     """Refuse what is no image, which trimesh would ignore."""
     for name in sorted(set(names)):
-        with resolver.noting(), mesh_files.open_image(resolver.path, resolver.get(name), f" {name[:100]!a}"):
+        with finder.noting(), open_image(finder.path, finder.get(name), f" {name[:100]!a}"):
             pass
 
 
@@ -124,37 +234,42 @@ def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
     return parsed
 
 
-def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: bool = True) -> Any:
-    trimesh = import_optional(resolver.path, "trimesh")
+def _load(
+    finder: FileFinder, content: bytes, kind: str, has_texture: bool = True
+) -> tuple[dict[str, Any], list[tuple[Array, str]]]:
+    """Return the parts of a file, and where its scene places them."""
+    trimesh = import_optional(finder.path, "trimesh")
     try:
-        with mesh_files.own_limit():
+        with own_limit():
             # vertices are split by texture coordinates only if there is a texture: colours go by vertices
             options = {"fix_texture": has_texture} if kind == "ply" else {}
             load = trimesh.exchange.load.mesh_loaders[kind]
-            parsed = load(BytesIO(content), resolver=resolver, **options)
+            parsed = load(BytesIO(content), resolver=finder, **options)
             scene = trimesh.load_scene(_with_raw_colors(parsed))
+            nodes = [scene.graph.get(node) for node in scene.graph.nodes_geometry]
     except (InputError, MemoryError):
         raise
     except Exception as error:  # whatever trimesh stumbles over
-        if resolver.refusal is None:
-            why = f"({mesh_files.first_line(error)}); the file may be damaged or cut off"
-            raise InputError(f"{resolver.path}: trimesh can't read it {why}") from error
-    if resolver.refusal is not None:
-        raise resolver.refusal
-    return scene
+        if finder.refusal is None:
+            why = f"({first_line(error)}); the file may be damaged or cut off"
+            raise InputError(f"{finder.path}: trimesh can't read it {why}") from error
+    if finder.refusal is not None:
+        raise finder.refusal
+    # not by the nodes' names: trimesh makes some up by chance
+    return scene.geometry, sorted(nodes, key=lambda node: (node[1], node[0].tobytes()))
 
 
 def load_ply(path: Path) -> Loaded:
     """Load a PLY file with faces."""
     content = path.read_bytes()
-    resolver = FolderResolver(path)
+    finder = FileFinder(path)
     header = content.partition(b"end_header")[0].decode("utf-8", "replace")
     textures = TEXTURE_COMMENT.findall(header)
     if len(textures) > 1:
         raise InputError(f"{path}: names {len(textures)} textures, wanted one")
-    _check_textures(resolver, textures)
-    loaded = Loaded(path, _scene(resolver, content, "ply", bool(textures)))
-    raw = [m.metadata["_ply_raw"] for m in loaded.scene.geometry.values() if "_ply_raw" in m.metadata]
+    _check_textures(finder, textures)
+    loaded = Loaded(path, *_load(finder, content, "ply", bool(textures)))
+    raw = [part.metadata["_ply_raw"] for part in loaded.parts.values() if "_ply_raw" in part.metadata]
     for elements, name in product(raw, ("vertex", "face")):
         data = elements[name].get("data")
         count = elements[name]["length"]
