@@ -30,8 +30,6 @@ RECORD_SIZES = {0: 20, 1: 28, 2: 26, 3: 34, 4: 57, 5: 63, 6: 30, 7: 36, 8: 38, 9
 COLORS_BYTE = {2: 20, 3: 28, 5: 28, 7: 30, 8: 30, 10: 30}
 INTENSITY_BYTE = 12
 FLAGS_BYTE = 15
-CLASS_BYTE_OLD = 15  # in the formats 0-5, whose upper three bits are flags
-CLASS_BYTE = 16  # in 6-10
 WANTED = "wanted LAS or LAZ with red green blue (point format 2, 3, 5, 7, 8 or 10)"
 MAX_VLRS = 1 << 16
 VLR_HEADER = struct.Struct("<2x16sHH32x")  # user, record id, length of what follows
@@ -62,16 +60,10 @@ class LasHeader(NamedTuple):
     def dtype(self) -> np.dtype[np.void]:
         """The fields that are read of a record."""
         fields = {"xyz": ("3<i4", 0), "intensity": ("<u2", INTENSITY_BYTE), "flags": ("u1", FLAGS_BYTE)}
-        fields["class"] = ("u1", CLASS_BYTE_OLD if self.point_format < 6 else CLASS_BYTE)
         if self.has_colors:
             fields["rgb"] = ("3<u2", COLORS_BYTE[self.point_format])
         kinds, at = zip(*fields.values(), strict=True)
         return np.dtype({"names": [*fields], "formats": kinds, "offsets": at, "itemsize": self.record_size})
-
-    @property
-    def num_extra(self) -> int:
-        """Extra bytes of a record."""
-        return self.record_size - RECORD_SIZES[self.point_format]
 
     @property
     def has_colors(self) -> bool:
