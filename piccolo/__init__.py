@@ -9,8 +9,31 @@ The example files are made by `make_room.py --out room --seed 4 --points 100000 
 ('localized', array([2.6 , 3.17, 1.21]))
 """
 
-import lazy_loader
+import ast
+from importlib import import_module
+from pathlib import Path
 
 __version__ = "0.1.0"
-# __init__.pyi has the names. Numba, SciPy and OpenCV take most of a second.
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+# Public names are imported at their first use, as Numba, SciPy and OpenCV take most of a second.
+# __init__.pyi, which type checkers read, says where each is.
+_stub = ast.parse(Path(__file__).with_suffix(".pyi").read_text())
+_modules = {
+    name.name: f".{node.module}"
+    for node in _stub.body
+    if isinstance(node, ast.ImportFrom)
+    for name in node.names
+}
+__all__ = list(_modules)
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name, and keep it."""
+    if name not in _modules:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(_modules[name], __name__), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return __all__

@@ -1,12 +1,14 @@
 import contextlib
+import errno
 import os
+import runpy
 import signal
 import subprocess
 import sys
 import threading
+import types
 from pathlib import Path
 
-import filelock
 import numpy as np
 import pytest
 from batches import run
@@ -16,7 +18,7 @@ from refusals import assert_input_error
 from piccolo.cli.command import UsageError, check_distinct, check_outputs, check_suffix, command
 from piccolo.geometry.pose import Pose
 from piccolo.system.errors import InputError
-from piccolo.system.files import atomic
+from piccolo.system.files import atomic, lock
 from piccolo.system.files.line_file import open_locked, whole_lines, whole_size
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -256,20 +258,36 @@ def test_two_processes_do_not_write_one_file(tmp_path):
 def test_a_lock_whose_file_was_removed_before_it_was_taken_is_taken_again(tmp_path, monkeypatch):
     """The first of two ends, and removes the lock's file, which the second has opened before."""
     out = tmp_path / "poses.jsonl"
-    lock_descriptor = filelock.lock_descriptor
+    lock_descriptor = atomic.lock_descriptor
     first = contextlib.ExitStack()
     first.enter_context(open_locked(out))
 
-    def lock_late(handle, blocking):
+    def lock_late(number):
         first.close()
-        return lock_descriptor(handle, blocking=blocking)
+        return lock_descriptor(number)
 
-    monkeypatch.setattr(filelock, "lock_descriptor", lock_late)
+    monkeypatch.setattr(atomic, "lock_descriptor", lock_late)
     with open_locked(out) as file:
         file.append("{}")
         assert len(list(tmp_path.iterdir())) == 2
     assert list(tmp_path.iterdir()) == [out]
     assert out.read_text() == "{}\n"
+
+
+def test_windows_locks_a_byte_and_says_so_if_another_has_it(monkeypatch):
+    taken = set()
+
+    def locking(number, mode, size):
+        assert (mode, size) == (msvcrt.LK_NBLCK, 1)
+        if number in taken:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        taken.add(number)
+
+    msvcrt = types.SimpleNamespace(LK_NBLCK=2, locking=locking)
+    monkeypatch.setitem(sys.modules, "msvcrt", msvcrt)
+    monkeypatch.setattr(sys, "platform", "win32")
+    lock_descriptor = runpy.run_path(lock.__file__)["lock_descriptor"]
+    assert [lock_descriptor(number) for number in (7, 8, 7)] == [True, True, False]
 
 
 HOLD = """

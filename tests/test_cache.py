@@ -52,6 +52,19 @@ def test_the_users_cache_is_made_and_used(folders, tmp_path, monkeypatch):
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path))
     assert _root() == tmp_path / ".cache" / "piccolo"
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # which the standard says to ignore
+    assert _root() == tmp_path / ".cache" / "piccolo"
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert cache.caches_of_user() == tmp_path / "Library" / "Caches"
+    monkeypatch.setattr(cache, "IS_WINDOWS", True)
+    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "local"))
+    assert cache.caches_of_user() == tmp_path / "local"
+
+
+def test_where_there_is_no_home_the_temporary_files_take_its_place(folders, monkeypatch):
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", "relative")
+    assert _root() == folders[1] / f"piccolo-{os.getuid()}"
 
 
 def test_where_it_can_not_be_made_a_private_folder_takes_its_place(folders):

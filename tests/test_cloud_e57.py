@@ -252,7 +252,7 @@ def test_limits_of_the_xml_section(tmp_path, monkeypatch):
 def test_a_missing_library_is_named(tmp_path, monkeypatch):
     path = write(tmp_path / "a.e57", [scan()])
     monkeypatch.setitem(sys.modules, "pye57.libe57", None)
-    assert_refused(r"needs pye57\.libe57, .*-r requirements-formats\.txt", open_source, path)
+    assert_refused(r"needs pye57\.libe57, .*in a checkout '\.\[formats\]'", open_source, path)
 
 
 def read_all(path):

@@ -217,7 +217,7 @@ def test_a_damaged_heic_and_a_missing_library_are_one_line(tmp_path, monkeypatch
         assert_refused("the HEIF is cut off, damaged or of an unsupported kind", read_panorama, path)
     path.write_bytes(content)
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    assert_refused(r"a\.heic: needs pillow_heif, .*-r requirements-formats\.txt", read_panorama, path)
+    assert_refused(r"a\.heic: needs pillow_heif, .*in a checkout '\.\[formats\]'", read_panorama, path)
 
 
 def test_insp_is_a_jpeg_of_two_fisheyes(tmp_path):

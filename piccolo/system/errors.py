@@ -65,7 +65,7 @@ def import_optional(what: Path | str, module_name: str, extra: str = "formats") 
         found = " ".join(str(error).split())
         raise ResourceError(
             f"{what}: needs {module_name}, which can't be imported ({found}); "
-            f"pip install 'piccolo-localize[{extra}]', in a checkout: -r requirements-{extra}.txt"
+            f"pip install 'piccolo-localize[{extra}]', in a checkout '.[{extra}]'"
         ) from error
 
 

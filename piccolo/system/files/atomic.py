@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import IO
 
 from ..errors import InputError
+from .lock import lock_descriptor
 
 Errors = type[Exception] | tuple[type[Exception], ...]
 STDOUT = Path("-")
@@ -273,14 +274,12 @@ def hold_lock(path: Path) -> Iterator[None]:
 
     What is locked is a file beside it, as on Windows nobody could read a locked one, nor remove it here.
     """
-    from filelock import lock_descriptor  # noqa: PLC0415  # who writes whole files only need not wait for it
-
     target = _target_of(path)
     digest = zlib.crc32(os.fsencode(target.name))
     beside = target.with_name(f"{temporary_prefix(target.name)}{digest:08x}.lock")
     while True:
         with beside.open("ab") as file:
-            if not lock_descriptor(file.fileno(), blocking=False):
+            if not lock_descriptor(file.fileno()):
                 raise InputError(f"{path}: another process is writing it; wait for its end")
             if not beside.exists() or not os.path.samestat(os.fstat(file.fileno()), beside.stat()):
                 continue  # whoever had the lock before has removed its file

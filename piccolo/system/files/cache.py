@@ -13,6 +13,7 @@ import logging
 import os
 import re
 import stat
+import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -49,6 +50,14 @@ def digest_of_sources(folders: tuple[str, ...]) -> str:
     return digest.hexdigest()
 
 
+def caches_of_user() -> Path:
+    """Return the folder in which programs of this system keep what they can make again."""
+    chosen = Path(os.environ.get("LOCALAPPDATA" if IS_WINDOWS else "XDG_CACHE_HOME", ""))
+    if chosen.is_absolute():
+        return chosen
+    return Path.home() / {"win32": "AppData/Local", "darwin": "Library/Caches"}.get(sys.platform, ".cache")
+
+
 @cache
 def cache_root() -> Path:
     """Return the user's folder for what is kept between runs (on Linux $XDG_CACHE_HOME/piccolo), made now.
@@ -56,11 +65,9 @@ def cache_root() -> Path:
     Where it can't be written, or others may write to it, a folder of the user's own among the temporary files
     takes its place; what lies there may hold code. OSError where that can't be trusted either.
     """
-    from platformdirs import user_cache_path  # noqa: PLC0415  # who keeps nothing need not wait for it
-
-    root = user_cache_path("piccolo", appauthor=False)
     temporary = Path(tempfile.gettempdir())
-    with suppress(OSError):
+    with suppress(OSError, RuntimeError):  # Python's error where there is no home
+        root = caches_of_user() / "piccolo"
         if not root.is_absolute():
             raise FileNotFoundError
         if is_own(make_writable(root).stat(), WRITABLE):

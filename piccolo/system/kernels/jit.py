@@ -23,7 +23,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-import llvmlite.binding as llvm
+import llvmlite.binding as llvm  # comes with Numba, in the version that Numba wants
 import numba
 import numpy as np
 from numba.core import compiler, serialize
