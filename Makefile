@@ -6,18 +6,21 @@
 # make test-wide     set up, try what photos and scans say wrongly of themselves; not in CI, some twenty minutes
 # make check         set up, lint, format and types
 # make check-page    the same of the report's page, and that its bundle is made from its sources (Node 20)
+# make test-lowest   set up, run tests that use each library, with the lowest versions that requirements.txt and pyproject.toml allow
+# make lock          write requirements.lock from requirements.txt and pyproject.toml; with UPGRADE=--upgrade, of the newest versions
+# make release       check that versions agree, make and try the files of a release in dist/; nothing is sent
 # make clean         remove what these made
 
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-all test-kernels kernels-plain kernels-checked test-browser test-wide check check-page clean
+.PHONY: demo test test-all test-kernels kernels-plain kernels-checked test-browser test-lowest test-wide check check-page lock release clean
 
-$(VENV)/ready: requirements.lock requirements-formats.lock requirements-gps.lock requirements-plans.lock requirements-colmap.lock requirements-serve.lock requirements-rerun.lock requirements-cluster.lock requirements-video.lock requirements-dev.lock
+$(VENV)/ready: requirements.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "found $$($(PYTHON) --version), wanted Python 3.11 or newer: make PYTHON=python3.11" >&2; exit 1; }
 	@$(PYTHON) -m venv $(VENV) || { echo "no virtual environment could be made; on Debian: apt-get install python3-venv" >&2; rm -rf $(VENV); exit 1; }
-	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -r requirements.lock -r requirements-formats.lock -r requirements-gps.lock -r requirements-plans.lock -r requirements-colmap.lock -r requirements-serve.lock -r requirements-rerun.lock -r requirements-cluster.lock -r requirements-video.lock -r requirements-dev.lock
+	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -r requirements.lock
 	@touch $@
 
 demo: $(VENV)/ready
@@ -49,16 +52,31 @@ kernels-plain: $(VENV)/ready
 kernels-checked: $(VENV)/ready
 	NUMBA_BOUNDSCHECK=1 $(BIN)/python -m pytest $(KERNELS:%=tests/test_%.py)
 
+# tests that call each library, and Numba's insides
+LOWEST := cache camera_files cloud_e57 cloud_las cloud_mesh cloud_pcd cloud_ply cloud_units cluster doors export export_models export_rerun export_tables localize panorama_formats pose p3p report_plan_file result service sphere threads memory verification video
+
+$(VENV)-lowest/ready: requirements.txt pyproject.toml | $(VENV)/ready
+	$(BIN)/uv venv --quiet --clear --python $(PYTHON) $(VENV)-lowest
+	$(BIN)/uv pip install --quiet --python $(VENV)-lowest/bin/python --resolution lowest-direct --group dev --all-extras -r pyproject.toml
+	@touch $@
+
+test-lowest: $(VENV)-lowest/ready
+	$(ONE_THREAD) $(VENV)-lowest/bin/python -m pytest $(LOWEST:%=tests/test_%.py)
+
+# wheels for each Python that pyproject.toml names
+lock: $(VENV)/ready
+	$(BIN)/uv pip compile --quiet pyproject.toml --all-extras --group dev --universal --python-version 3.11 --no-annotate --custom-compile-command "make lock" $(UPGRADE) --output-file requirements.lock
+	for version in 3.11 3.12 3.13 3.14; do $(BIN)/uv pip compile --quiet requirements.lock --no-deps --only-binary :all: --python-version $$version --output-file /dev/null || exit 1; done
+
+release: $(VENV)/ready
+	.ci/release $(BIN)
+
 test-wide: $(VENV)/ready
 	@mkdir -p demo
 	$(BIN)/python tools/benchmark.py confidence --claims --seeds 0 3 --scenes examples/flat --out demo/wide.jsonl
 
-test-browser: $(VENV)/browser page/node_modules/ready
+test-browser: $(VENV)/ready page/node_modules/ready
 	$(BIN)/python -m pytest browser_tests
-
-$(VENV)/browser: $(VENV)/ready requirements-browser.lock
-	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -r requirements-browser.lock
-	@touch $@
 
 page/node_modules/ready: page/package-lock.json
 	@command -v npm > /dev/null || { echo "found no npm; on Debian: apt-get install npm" >&2; exit 1; }
@@ -74,4 +92,4 @@ check: $(VENV)/ready
 	$(BIN)/mypy
 
 clean:
-	rm -rf $(VENV) demo page/node_modules browser_tests/screenshots .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(VENV)-lowest demo build dist *.egg-info page/node_modules browser_tests/screenshots .mypy_cache .ruff_cache .pytest_cache .hypothesis

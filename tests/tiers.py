@@ -13,6 +13,7 @@ from piccolo.localization.paper import PaperMap
 from piccolo.scan_map.scan_map import ScanMap
 from piccolo.system.kernels.ahead import HELPS
 
+FONTS = "fc-list"  # what lists the fonts for Matplotlib, once a machine; HELPS compile kernels, once a machine
 TIERS = ("pure", "scene", "process")  # each may use what those before it use
 
 
@@ -32,7 +33,7 @@ def watch(patch):
         original = getattr(owner, name)
 
         def noting(self, *given, **options):
-            is_help = tier == "process" and bool(given) and HELPS in given[0]  # to compile kernels
+            is_help = tier == "process" and bool(given) and (HELPS in given[0] or FONTS in given[0])
             needed.extend([] if is_help else [tier])
             return original(self, *given, **options)
 
