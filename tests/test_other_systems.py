@@ -16,7 +16,7 @@ VARYING = rb'"seconds": ?{[^}]*}|[0-9a-f]{32}'
 ELSEWHERE = f"""
 import os, signal, sys
 import concurrent.futures.process, multiprocessing.resource_tracker, numba, psutil, tempfile, tqdm
-import piccolo.files.lock
+import piccolo.system.files.lock
 for name in {SYSTEMS_OWN}:
     sys.modules[name] = None
 for name in "getuid fchmod fchown pread sched_getaffinity register_at_fork sysconf O_NOFOLLOW".split():

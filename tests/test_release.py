@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 import piccolo
-from piccolo.service.description import describe_service
+from piccolo.apps.service.description import describe_service
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())

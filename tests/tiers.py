@@ -13,7 +13,7 @@ from piccolo.localization.paper import PaperMap
 from piccolo.scan_map.scan_map import ScanMap
 from piccolo.system.kernels.ahead import HELPS
 
-FONTS = "fc-list"  # what lists the fonts for Matplotlib, once a machine; HELPS compile kernels, once a machine
+FONTS = "fc-list"  # lists a machine's fonts for Matplotlib, once; as HELPS compile kernels
 TIERS = ("pure", "scene", "process")  # each may use what those before it use
 
 
