@@ -4,7 +4,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtri, stdtr
 
 from ..system.arrays import Array
 from .consensus import MOST_LOG
@@ -78,6 +77,8 @@ def count_freedom(of_blocks: Array, weights: Array) -> Array:
 
 def as_normal(deviations: Array, freedom: Array) -> Array:
     """Return the deviations (n,) of a normal distribution that are as rare as others of Student's."""
+    from scipy.special import ndtri, stdtr  # noqa: PLC0415  # only who doubts a geometry waits for it: 0.1 s
+
     return np.asarray(-ndtri(np.maximum(stdtr(freedom, -deviations), LEAST_CHANCE)))
 
 
