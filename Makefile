@@ -52,8 +52,8 @@ kernels-plain: $(VENV)/ready
 kernels-checked: $(VENV)/ready
 	NUMBA_BOUNDSCHECK=1 $(BIN)/python -m pytest $(KERNELS:%=tests/test_%.py)
 
-# tests that call each library, and Numba's insides
-LOWEST := cache camera_files cloud_e57 cloud_las cloud_mesh cloud_pcd cloud_ply cloud_units cluster doors export export_models export_rerun export_tables localize panorama_formats pose p3p report_plan_file result service sphere threads memory verification video
+# tests that call each library, and Numba's insides; and golden poses
+LOWEST := cache camera_files cloud_e57 cloud_las cloud_mesh cloud_pcd cloud_ply cloud_units cluster doors export export_models export_rerun export_tables localize panorama_formats pose p3p report_plan_file result service sphere threads memory view video
 
 $(VENV)-lowest/ready: requirements.txt pyproject.toml | $(VENV)/ready
 	$(BIN)/uv venv --quiet --clear --python $(PYTHON) $(VENV)-lowest
@@ -61,7 +61,7 @@ $(VENV)-lowest/ready: requirements.txt pyproject.toml | $(VENV)/ready
 	@touch $@
 
 test-lowest: $(VENV)-lowest/ready
-	$(ONE_THREAD) $(VENV)-lowest/bin/python -m pytest $(LOWEST:%=tests/test_%.py)
+	$(ONE_THREAD) $(VENV)-lowest/bin/python -m pytest $(LOWEST:%=tests/test_%.py) tests/test_localization.py::test_golden_poses tests/test_paper_method.py::test_golden_poses
 
 # wheels for each Python that pyproject.toml names
 lock: $(VENV)/ready
