@@ -15,7 +15,9 @@ from piccolo.geometry.pose import Pose, exp_so3, uniform_yaws, yaw_rotation
 from piccolo.geometry.sphere import BLOCK_RINGS, find_cell, pixel_rays, solid_angles
 from piccolo.judge.candidate import CONTRADICTS, Comparison
 from piccolo.judge.selection import is_mirrored
+from piccolo.localization.beam import Ends
 from piccolo.localization.mirror import find_mirrored, is_found_again, list_mirrored
+from piccolo.localization.search import Starts
 from piccolo.optimize.channel_loss import CHANCE_CORRELATION, NUM_BLOCKS
 from piccolo.photo.panorama import Panorama
 from piccolo.photo.panorama.texels import pack_texels
@@ -229,9 +231,14 @@ def test_a_photo_that_views_explain_as_well_is_not_mirrored_by_its_matches(score
 
 
 def test_the_mirrored_photo_is_searched_as_thoroughly_as_its_own_pose_needs():
-    """Briefly, if a brief search finds nine tenths of the score at the photo's own pose; also upside down."""
-    assert is_found_again(0.37, 0.4)
-    assert not is_found_again(0.35, 0.4)
+    """Briefly, if the best end of a brief search is the photo's own pose; also upside down."""
+    own = Pose(np.eye(3), np.zeros(3))
+    starts = Starts(
+        np.stack([np.eye(3)] * 2), np.array([[0.3, 0.0, 0.0], [0.6, 0.0, 0.0]]), np.zeros(2, np.int64)
+    )
+    assert is_found_again(Ends(starts, np.array([0.5, 0.4])), own)
+    assert not is_found_again(Ends(starts, np.array([0.4, 0.5])), own)
+    assert not is_found_again(Ends(starts.take(np.arange(0)), np.empty(0)), own)
     rotations = list_mirrored(TILTED, 12)
     upright = np.array([1.0, -1.0, 1.0])[:, None] * TILTED * [1.0, -1.0, 1.0] @ uniform_yaws(12)
     np.testing.assert_allclose(rotations[:12], upright, atol=1e-12)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..evidence.examine import count_agreeing
+from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose, uniform_yaws
 from ..judge.candidate import Candidate
 from ..judge.selection import explains_more
@@ -15,10 +16,9 @@ from ..problem.settings import Effort
 from ..system.arrays import Array
 from ..system.jobs.threads import Workers
 from .attempts import FIRST_BEAM
-from .beam import descend_briefly, refine_starts, score_briefly, score_near
+from .beam import Ends, descend_briefly, refine_starts
 from .search import search_poses
 
-FOUND_AGAIN = 0.9  # least score of an end of a brief search, as a fraction of the pose's, to count as found
 UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 
 
@@ -51,16 +51,18 @@ def search_mirrored(
     """Return poses of the mirrored photo, best first, by what found the photo's own: features, or views.
 
     A wall or a ceiling seen from behind fits the mirrored photo: its tilt is that of the pose found, or that
-    upside down. The search is brief if a brief one finds the photo's own pose.
+    upside down. The search is brief if a brief one finds the photo's own pose, of all poses the best.
     """
     asked = replace(mirrored, rotations=list_mirrored(pose.R_cam_from_world, effort.num_yaws))
     own = replace(problem, rotations=pose.R_cam_from_world @ uniform_yaws(effort.num_yaws))
-    own_score = score_near(problem, pose, workers)
-    if not is_found_again(score_briefly(own, effort.brief(), workers), own_score):
+    own_ends = descend_briefly(own, effort.brief(), workers)
+    if not is_found_again(own_ends, pose):
         starts = search_poses(asked, "known", effort, workers)
         return refine_starts(asked, starts, problem.profile.beam, workers)
     ends = descend_briefly(asked, effort.brief(), workers)
-    return refine_starts(asked, ends.poses, FIRST_BEAM, workers) if ends.best_score > own_score else []
+    return (
+        refine_starts(asked, ends.poses, FIRST_BEAM, workers) if ends.best_score > own_ends.best_score else []
+    )
 
 
 def list_mirrored(R_cam_from_map: Array, num_yaws: int) -> Array:
@@ -70,6 +72,7 @@ def list_mirrored(R_cam_from_map: Array, num_yaws: int) -> Array:
     return np.asarray(tilt @ np.concatenate([yaws, UPSIDE_DOWN @ yaws]))
 
 
-def is_found_again(brief_score: float, own_score: float) -> bool:
-    """Return True if a brief search finds about the score that a photo has at its own pose."""
-    return brief_score >= FOUND_AGAIN * own_score
+def is_found_again(ends: Ends, pose: Pose) -> bool:
+    """Return True if the best end of a brief search is near a pose."""
+    best = ends.poses.take(ends.scores.argsort()[-1:]).poses()
+    return any(ONE_ANSWER.holds(end, pose) for end in best)
