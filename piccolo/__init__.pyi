@@ -17,10 +17,10 @@ from .judge.result_parts import (
 )
 from .localization.paper import PaperSettings as PaperSettings
 from .photo.photo import GpsPrior as GpsPrior, Photo as Photo, Prior as Prior
+from .poses.bundle_adjustment import RelativePoses as RelativePoses
 from .problem.accuracy import Accuracy as Accuracy
 from .problem.settings import CoarseToFineSettings as CoarseToFineSettings
 from .system.errors import InputError as InputError
-from .together.bundle_adjustment import RelativePoses as RelativePoses
 from .together.coloring.color_scan import Coloring as Coloring
 from .together.walk.frames import Motion as Motion
 

@@ -13,7 +13,7 @@ COMMANDS = {
     "localize": "piccolo.cli.localize",
     "prepare_map": "piccolo.cli.prepare_map",
     "align_gravity": "piccolo.apps.align_gravity",
-    "align_model": "piccolo.apps.export.align_model",
+    "align_model": "piccolo.apps.models.align_model",
     "calibrate_mount": "piccolo.apps.mount.calibrate_mount",
     "color_scan": "piccolo.apps.color_scan",
     "e57_images": "piccolo.apps.e57_images",

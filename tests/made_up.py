@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 
 from piccolo.geometry.pose import Pose, yaw_rotation
+from piccolo.geometry.sphere import CHANCE_CORRELATION
 from piccolo.judge.alternatives import Hypothesis
 from piccolo.judge.candidate import Candidate, Comparison, Selection
 from piccolo.local_features.matching import Matches
-from piccolo.optimize.channel_loss import CHANCE_CORRELATION
 from piccolo.photo.photo import NOTHING_KNOWN
 from piccolo.problem.problem import Problem
 from piccolo.problem.profile import PROFILES

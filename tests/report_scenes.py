@@ -15,8 +15,8 @@ from piccolo.judge.belief import make_belief
 from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.judge.result import Result
 from piccolo.judge.result_parts import Alternative, Evidence, Gap, Source, WalkFrame
+from piccolo.photo.panorama.picture import encode_image
 from piccolo.system.jobs.threads import Workers
-from piccolo.views.pictures import encode_image
 from research.synthetic.world import make_world, photograph, pose_of_query, scan_world
 
 SIZE = np.array([4.5, 3.5, 2.5])

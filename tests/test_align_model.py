@@ -12,11 +12,11 @@ import pytest
 from poses import result, write_results
 from refusals import small_files
 
-from piccolo.apps.export import align_model
-from piccolo.batch.relative_poses import read_relative_poses
+from piccolo.apps.models import align_model
 from piccolo.geometry.pose import OPENGL_FROM_CAM, OPTICAL_FROM_CAM, Pose, exp_so3, log_so3
 from piccolo.geometry.pose_gaussian import add
 from piccolo.judge.pose_covariance import PoseCovariance
+from piccolo.poses.relative_poses import read_relative_poses
 
 ORIGIN = np.array([500_000.0, 5_400_000.0, 300.0])
 SCALE = 0.37  # model from scan

@@ -20,6 +20,8 @@ from piccolo.judge.result import Result, nothing_found
 from piccolo.judge.result_parts import Alternative
 from piccolo.localization.judging import Found
 from piccolo.photo.panorama import Panorama
+from piccolo.poses import bundle_adjustment
+from piccolo.poses.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
 from piccolo.system.jobs.threads import Stopwatch, Workers
 from piccolo.together import bundle_search
 from piccolo.together.bundle import (
@@ -31,7 +33,6 @@ from piccolo.together.bundle import (
     localize_bundle,
     merge_places,
 )
-from piccolo.together.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
 
 TIER = "scene"
 
@@ -212,7 +213,7 @@ def test_bundles_are_the_same_where_the_photos_are(far):
 
 def test_the_common_frame_is_moved_near():
     cams = [member.cam_from_bundle for member in _members(1e6)]
-    moved = bundle_search.move_origin_near(cams)
+    moved = bundle_adjustment.move_origin_near(cams)
     assert np.linalg.norm(np.mean([pose.center_world for pose in moved], axis=0)) < 1e-9
     there = moved[1].center_world - moved[0].center_world
     np.testing.assert_allclose(there, cams[1].center_world - cams[0].center_world, atol=1e-9)

@@ -9,7 +9,7 @@ from scipy.special import chdtri
 
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add, subtract
-from piccolo.together.bundle_adjustment import (
+from piccolo.poses.bundle_adjustment import (
     LIKELY,
     Bundle,
     Estimate,

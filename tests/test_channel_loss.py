@@ -17,6 +17,7 @@ from piccolo.geometry.levenberg_marquardt import (
     solve_damped,
 )
 from piccolo.geometry.pose import Pose, exp_so3, step
+from piccolo.geometry.sphere import CHANCE_CORRELATION, NUM_BLOCKS
 from piccolo.optimize import channel_loss
 from piccolo.photo.panorama.texels import pack_texels
 
@@ -90,13 +91,13 @@ def test_a_point_on_masked_pixels_costs_half_of_the_most_it_could():
 
 def test_moments_of_each_block_are_over_what_both_show():
     arguments, (shown, levels, w, blocks) = _blockwise()
-    sums = np.empty((channel_loss.NUM_BLOCKS, channel_loss.NUM_MOMENTS))
+    sums = np.empty((NUM_BLOCKS, channel_loss.NUM_MOMENTS))
     channel_loss.correlate(*arguments, sums)
     a = levels - 127.5
     b = shown - 127.5
     products = np.stack([(a * b).sum(axis=0), (a * a).sum(axis=0), (b * b).sum(axis=0)])
     terms = w * np.concatenate([products, np.ones((1, len(w))), a, b])
-    expected = [[term[blocks == block].sum() for term in terms] for block in range(channel_loss.NUM_BLOCKS)]
+    expected = [[term[blocks == block].sum() for term in terms] for block in range(NUM_BLOCKS)]
     np.testing.assert_allclose(sums, expected, rtol=1e-3, atol=0.5)
     np.testing.assert_allclose(sums[:, 3], np.array(expected)[:, 3], rtol=1e-5)
     np.testing.assert_allclose(sums[:, 4:], np.array(expected)[:, 4:], atol=2e-3)
@@ -115,7 +116,7 @@ def test_plain_blocks_do_not_correlate_whatever_their_colours_are():
     """Nor does noise below the least deviation; but an edge as strong as it does."""
     points, _, weights, rgb = _problem()
     weights = (weights / weights.sum()).astype(np.float32)
-    blocks = (np.arange(len(weights)) * channel_loss.NUM_BLOCKS // len(weights)).astype(np.int32)
+    blocks = (np.arange(len(weights)) * NUM_BLOCKS // len(weights)).astype(np.int32)
     plain = np.full_like(rgb, (200, 90, 180))
     step_up = np.where(np.arange(rgb.shape[1])[None, :, None] < rgb.shape[1] // 2, 100, 160).astype(np.uint8)
     step_up = np.ascontiguousarray(np.broadcast_to(step_up, rgb.shape))
@@ -145,7 +146,7 @@ def _blockwise():
     noise = np.linspace(0, 200, points.shape[1]).astype(np.float32)
     levels = np.clip(shown + noise * (levels - 130) / 70, 0, 255).astype(np.float32)
     w = weights * (naive.sample(is_valid[..., None], pixels)[:, 0] > 1 - 1e-9) / weights.sum()
-    blocks = (np.arange(points.shape[1]) * channel_loss.NUM_BLOCKS // points.shape[1]).astype(np.int32)
+    blocks = (np.arange(points.shape[1]) * NUM_BLOCKS // points.shape[1]).astype(np.int32)
     texels = pack_texels(rgb, is_valid)
     how = texels.rgbx, texels.width, TILTED.R_cam_from_world, TILTED.center_world
     arguments = points, levels, (weights / weights.sum()).astype(np.float32), blocks, *how
@@ -163,11 +164,7 @@ def _score(shown, levels, weights, blocks):
         b = b - np.average(b, axis=1, weights=w)[:, None]
         variances = [max((w * x * x).sum() / w.sum(), channel_loss.FLAT_BLOCK**2) for x in (a, b)]
         correlation = (w * a * b).sum() / w.sum() / math.sqrt(variances[0] * variances[1])
-        total += (
-            max(correlation - channel_loss.CHANCE_CORRELATION, 0)
-            / (1 - channel_loss.CHANCE_CORRELATION)
-            * w.sum()
-        )
+        total += max(correlation - CHANCE_CORRELATION, 0) / (1 - CHANCE_CORRELATION) * w.sum()
     return total
 
 

@@ -12,13 +12,19 @@ from made_up import make_candidate
 from piccolo.evidence import comparison
 from piccolo.evidence.examine import count_agreeing, examine
 from piccolo.geometry.pose import Pose, exp_so3, uniform_yaws, yaw_rotation
-from piccolo.geometry.sphere import BLOCK_RINGS, find_cell, pixel_rays, solid_angles
+from piccolo.geometry.sphere import (
+    BLOCK_RINGS,
+    CHANCE_CORRELATION,
+    NUM_BLOCKS,
+    find_cell,
+    pixel_rays,
+    solid_angles,
+)
 from piccolo.judge.candidate import CONTRADICTS, Comparison
 from piccolo.judge.selection import is_mirrored
 from piccolo.localization.beam import Ends
 from piccolo.localization.mirror import find_mirrored, is_found_again, list_mirrored
 from piccolo.localization.search import Starts
-from piccolo.optimize.channel_loss import CHANCE_CORRELATION, NUM_BLOCKS
 from piccolo.photo.panorama import Panorama
 from piccolo.photo.panorama.texels import pack_texels
 from piccolo.problem.method import METHOD

@@ -11,6 +11,7 @@ from piccolo.cloud import layers
 from piccolo.cloud.octree import build_octree
 from piccolo.evidence import covariance
 from piccolo.evidence.examine import examine
+from piccolo.evidence.scan_errors import gap_variance
 from piccolo.geometry.pose import exp_so3
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.system.jobs.threads import Workers
@@ -123,10 +124,10 @@ def test_few_points_have_no_layers():
 
 def test_a_position_between_two_layers_is_within_their_deviation():
     motion = np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.01], [0.06, 0.0, 0.0]])
-    assert layers.gap_variance(motion, motion[0], 0.0) == pytest.approx(0.06**2 / 12.0)
+    assert gap_variance(motion, motion[0], 0.0) == pytest.approx(0.06**2 / 12.0)
     aside = motion[0] + np.array([0.0, 6.0, 1.0])  # where the layers meet
-    assert layers.gap_variance(motion, aside, 0.0) == pytest.approx(0.0)
-    assert layers.gap_variance(motion, aside, 3.0) == pytest.approx(0.03**2 / 12.0)
+    assert gap_variance(motion, aside, 0.0) == pytest.approx(0.0)
+    assert gap_variance(motion, aside, 3.0) == pytest.approx(0.03**2 / 12.0)
 
 
 def test_the_map_warns_of_layers_once_and_says_where_they_are():

@@ -9,8 +9,8 @@ from piccolo.cloud.octree import build_octree
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.local_features.perspective_view import MULTIPLE, add_margin, cover_sphere, view_around
-from piccolo.local_features.view_image import fill_gaps, render_gray
 from piccolo.system.jobs.threads import Workers
+from piccolo.views.view_image import fill_gaps, render_gray
 from research.synthetic.raycast import cast_rays
 
 TIER = "scene"

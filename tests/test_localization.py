@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from piccolo.cloud.stream import Cloud, stream_of_arrays
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, uniform_yaws
 from piccolo.photo.photo import Prior
-from piccolo.problem.prior import allow_rotations, apply_prior
+from piccolo.problem.prior import allow_rotations, apply_prior, ball_of
 from piccolo.scan_map import camera_positions
 from piccolo.scan_map.camera_positions import find_supported_cells, heights_above_floor, top_surfaces
 from piccolo.scan_map.scan_map import prepare_map
@@ -170,7 +170,7 @@ def test_a_scan_too_large_is_refused_or_prepared_where_the_prior_says(monkeypatc
             prepare_map(cloud, Workers(1))
     prior = Prior(near=tuple(center + whole.origin_world), radius=1.0)
     said = []
-    part = prepare_map(cloud, Workers(1, warn=said.append), prior=prior)
+    part = prepare_map(cloud, Workers(1, warn=said.append), part=ball_of(prior))
     assert part.is_partial
     assert said == list(part.warnings)
     assert "prepared within 1 m of `near`" in said[0]
@@ -178,7 +178,7 @@ def test_a_scan_too_large_is_refused_or_prepared_where_the_prior_says(monkeypatc
     left = {tuple(c) for c in apply_prior(part, prior).centers}
     assert {tuple(c) for c in whole.centers[is_near]} <= left
     far = Prior(near=(900.0, 0.0, 0.0), radius=1.0)
-    assert len(prepare_map(cloud, Workers(1), prior=far).centers) == 0
+    assert len(prepare_map(cloud, Workers(1), part=ball_of(far)).centers) == 0
 
 
 def test_a_long_preparation_is_announced(monkeypatch):

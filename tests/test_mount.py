@@ -13,8 +13,6 @@ from refusals import assert_input_error, assert_refused
 from piccolo.apps.mount import calibrate_mount
 from piccolo.apps.mount.mount import Sighting, Trajectory, fit_mount
 from piccolo.batch.inputs import read_priors
-from piccolo.batch.pose_table import read_pose_table
-from piccolo.batch.relative_poses import read_relative_poses
 from piccolo.geometry.pose import (
     Pose,
     angle_between,
@@ -25,6 +23,8 @@ from piccolo.geometry.pose import (
 from piccolo.geometry.pose_gaussian import add, subtract
 from piccolo.judge.pose_covariance import PoseCovariance
 from piccolo.photo.photo import Prior
+from piccolo.poses.pose_table import read_pose_table
+from piccolo.poses.relative_poses import read_relative_poses
 
 CLOCK = 0.08
 PHOTO = np.repeat([np.radians(0.05), 0.004], 3)  # deviations of a photo's pose

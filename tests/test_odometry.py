@@ -8,9 +8,9 @@ from poses import SIZE, assert_same_poses, result, tilted_poses
 
 from piccolo.apps.export.formats import export
 from piccolo.apps.export.posed_images import Options
-from piccolo.batch.inputs import times_of
-from piccolo.batch.relative_poses import read_odometry, read_relative_poses
 from piccolo.geometry.pose import exp_so3, quaternion_wxyz, yaw_rotation
+from piccolo.poses.relative_poses import read_odometry, read_relative_poses
+from piccolo.poses.times import times_of
 from piccolo.system.errors import InputError
 
 POSES = tilted_poses(4, np.array([20.0, -30.0, 2.0]))

@@ -13,7 +13,7 @@ from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import Pose, exp_so3, step
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.localization.paper import localize, prepare
-from piccolo.optimize.refine import refine
+from piccolo.localization.paper_descent import refine
 from piccolo.photo.panorama.model import shrink
 from piccolo.system.errors import InputError
 from piccolo.system.jobs.threads import Stopwatch, Workers
@@ -140,7 +140,7 @@ def test_descent_recovers_the_true_pose(solver):
 def test_camera_is_found_with_the_same_bits_for_any_number_of_threads(initialization):
     quick = {"num_translations": 20, "max_points": 30_000, "num_iterations": 40, "num_by_histogram": 3}
     settings = PhotometricSettings(photometric_width=128, initialization=initialization, **quick)
-    paper_map = prepare(room(1)[1], settings)
+    paper_map = prepare(room(1)[1].pack(), settings)
     panorama = as_panorama(query(1).rgb)
     one, two = (localize(paper_map, panorama, settings, Workers(n), Stopwatch()) for n in (1, 2))
     assert errors(one.pose, query(1).pose)[0] < 0.1

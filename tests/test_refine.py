@@ -8,7 +8,7 @@ import rooms
 
 from piccolo.geometry.pose import Pose, step, yaw_rotation
 from piccolo.localization.paper import PaperSettings
-from piccolo.optimize.refine import Adam, descend_lbfgs, make_sampling_loss, refine
+from piccolo.localization.paper_descent import Adam, descend_lbfgs, make_sampling_loss, refine
 from piccolo.photo.panorama.texels import pack_texels
 
 PERTURBATION = np.array([0.05, -0.04, 0.12, 0.15, -0.12, 0.08])  # rad, m

@@ -13,12 +13,11 @@ from piccolo.evidence.examine import examine
 from piccolo.geometry.cone import EVERYWHERE
 from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose import Pose, step
-from piccolo.geometry.sphere import make_grid
+from piccolo.geometry.sphere import NUM_BLOCKS, make_grid
 from piccolo.judge.candidate import CONTRADICTS, Comparison
 from piccolo.localization import beam, ladder
 from piccolo.localization.beam import best_and_alternatives, narrow
 from piccolo.localization.search import Starts
-from piccolo.optimize.channel_loss import NUM_BLOCKS
 from piccolo.problem.method import METHOD
 from piccolo.problem.profile import VIEWS, WHOLE_BEAM
 from piccolo.problem.stages import AROUND_FINE, AROUND_MIDDLE, FULL, LAST, NEARLY, SECOND, Limits, Rounds

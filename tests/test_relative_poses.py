@@ -11,11 +11,11 @@ from refusals import assert_refused
 
 from piccolo.apps.export.formats import export
 from piccolo.apps.export.posed_images import Options
-from piccolo.batch.relative_poses import find_scale, read_odometry, read_relative_poses, read_tum_row
 from piccolo.geometry.pose import (
     OPTICAL_FROM_CAM,
     rotation_from_quaternion_wxyz,
 )
+from piccolo.poses.relative_poses import find_scale, read_odometry, read_relative_poses, read_tum_row
 
 POSES = tilted_poses(4, np.array([20.0, -30.0, 2.0]))
 PHOTOS = [Path(f"photos/{k}.jpg") for k in (7, 8, 12, 100)]

@@ -22,9 +22,10 @@ from piccolo.geometry.pose import (
     step,
 )
 from piccolo.geometry.sphere import compute_pixels, pixel_rays
+from piccolo.photo.panorama.picture import encode_image
 from piccolo.system.errors import InputError
 from piccolo.system.jobs.threads import Workers
-from piccolo.views.pictures import encode_image, fill_holes
+from piccolo.views.pictures import fill_holes
 from piccolo.views.surfels import (
     BAND_OFFSET,
     MAX_SLOPE,

@@ -15,11 +15,11 @@ import piccolo
 from piccolo.api.result_files import read_results
 from piccolo.apps.export.formats import export
 from piccolo.apps.export.posed_images import Options
-from piccolo.batch.relative_poses import read_relative_poses
 from piccolo.cli.localize import main
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.photo.camera import Mount
 from piccolo.photo.camera.model import pinhole
+from piccolo.poses.relative_poses import read_relative_poses
 from piccolo.system.jobs.threads import Workers
 from research.synthetic.world import render_picture
 

@@ -13,7 +13,6 @@ from pictures import encoded, write, write_photo
 from poses import judged
 from refusals import assert_input_error
 
-from piccolo.batch.inputs import times_of
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
 from piccolo.geometry.pose_gaussian import PoseGaussian
 from piccolo.judge.belief import make_belief
@@ -21,6 +20,7 @@ from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result, nothing_found
 from piccolo.judge.result_parts import Alternative, Evidence
 from piccolo.photo.photo import Photo
+from piccolo.poses.times import times_of
 from piccolo.problem.accuracy import PAPER_ACCURACY, Accuracy
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.system.errors import InputError

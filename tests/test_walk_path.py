@@ -9,9 +9,10 @@ from key_frames import MOTION, Open, make_followed, make_key, make_pose
 from refusals import assert_input_error
 
 from piccolo.geometry.pose import Pose, carry, exp_so3, pose_errors, yaw_rotation
+from piccolo.poses.times import check_times
 from piccolo.system.errors import InputError
 from piccolo.together.walk import path as walk_path
-from piccolo.together.walk.frames import JUMP_LOG, MOST_EXPECTED, Frame, Motion, check_times
+from piccolo.together.walk.frames import JUMP_LOG, MOST_EXPECTED, Frame, Motion
 from piccolo.together.walk.path import believe
 
 

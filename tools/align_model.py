@@ -1,4 +1,4 @@
 #!/usr/bin/env python3
 from _checkout import run
 
-run(__name__, "piccolo.apps.export.align_model")
+run(__name__, "piccolo.apps.models.align_model")

@@ -12,11 +12,12 @@ from ..cloud.settings import METRES, CloudSettings, UpAxis
 from ..cloud.stream import ARRAYS, CloudStream, open_cloud, stream_of_arrays
 from ..localization.paper import PaperMap, prepare as prepare_by_paper
 from ..photo.photo import File
+from ..problem.prior import ball_of
 from ..problem.settings import CoarseToFineSettings
-from ..scan_map.open_map import CachePolicy, find_prepared_map, open_map
+from ..scan_map.open_map import CachePolicy, find_prepared_map, open_map, open_points
 from ..scan_map.scan_map import ScanMap, check_within, prepare_map
 from ..system.arguments import check_fields, check_kind
-from ..system.arrays import Floats, Values
+from ..system.arrays import Array, Floats, Values
 from ..system.errors import InputError
 from ..system.files.cache import sha256_of_files
 from ..system.jobs.threads import (
@@ -30,6 +31,7 @@ from ..system.jobs.threads import (
 from .photo_reader import Settings
 from .scan import Scan
 
+__all__ = ["Cloud", "find_prepared_map", "open_files", "open_points", "open_scan", "scan_of"]
 Units = Literal["mm", "cm", "m", "ft", "us-ft"]
 DEFAULT = CoarseToFineSettings()
 
@@ -179,7 +181,7 @@ def open_files(
     watch = Stopwatch()
     name = str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
     if isinstance(settings, CoarseToFineSettings):
-        scan_map = open_map(paths, cloud_settings, cache, workers, watch, settings.prior)
+        scan_map = open_map(paths, cloud_settings, cache, workers, watch, ball_of(settings.prior))
         check_within(scan_map, settings.prior.within)
         return Scan(scan_map, name, cloud_settings, settings, workers, watch.seconds)
     if map_path := find_prepared_map(paths):
@@ -197,12 +199,13 @@ def scan_of(
     settings: Settings,
     workers: Workers,
     watch: Stopwatch,
+    up: Array | None = None,
 ) -> Scan:
-    """Prepare a scan for the method that the settings belong to."""
+    """Prepare a scan for the method that the settings belong to; a rotation `up` (3, 3) makes its z up."""
     prepared: ScanMap | PaperMap
     if isinstance(settings, CoarseToFineSettings):
-        up = cloud_settings.up
-        prepared = prepare_map(cloud, workers, up, watch, prior=settings.prior)
+        axis = cloud_settings.up if up is None else up
+        prepared = prepare_map(cloud, workers, axis, watch, ball_of(settings.prior))
     elif not cloud.has_colors:
         raise InputError(f"{cloud.label}: found no colours to be used, wanted some for the preset paper")
     else:
@@ -211,6 +214,6 @@ def scan_of(
         for warning in points.warnings:
             workers.warn(warning)
         with watch.stage("prepare"):
-            prepared = prepare_by_paper(points, settings)
+            prepared = prepare_by_paper(points.pack(), settings)
     prepared = replace(prepared, scan_sha256=cloud.sha256)
     return Scan(prepared, name, cloud_settings, settings, workers, watch.seconds)

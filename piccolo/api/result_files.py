@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..judge.result import Result
+from ..scan_map.open_map import CachePolicy, scan_sha256_of
 from ..system.errors import UNPRINTABLE, InputError
 from ..system.files.json_file import parse_lines, read_bytes
 
@@ -37,6 +38,11 @@ def check_scan(results: Sequence[Result], cloud_sha256: str, scan: str, is_force
         first = f"the first of {others[0].cloud_name}"
         raise InputError(f"{others[0].pano}: {words}, {first}, wanted this scan, or `force`")
     return words
+
+
+def digest_of_scan(paths: Sequence[Path]) -> str:
+    """Return the digest of a scan's files, or of the scan that a prepared map is of."""
+    return scan_sha256_of(paths, CachePolicy())
 
 
 def _parse_result(text: str) -> Result:

@@ -17,6 +17,7 @@ from ..localization.means import NO_TRACE, Trace
 from ..localization.paper import PaperMap
 from ..photo.panorama import read_panorama
 from ..photo.photo import File, Photo, Prior, as_photo
+from ..poses.bundle_adjustment import RelativePoses
 from ..problem.accuracy import Accuracy
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.open_map import write_map
@@ -26,7 +27,6 @@ from ..system.arrays import Bytes, Floats
 from ..system.errors import InputError
 from ..system.files.atomic import check_output
 from ..system.jobs.threads import Workers
-from ..together.bundle_adjustment import RelativePoses
 from ..together.coloring.color_scan import Coloring
 from ..together.second_looks import Look, localize_in_order
 from ..together.walk.frames import Motion

@@ -9,12 +9,12 @@ from ..localization.localize import has_guessed_focal
 from ..localization.means import NO_TRACE, Trace
 from ..localization.places import add_places
 from ..photo.photo import Photo
+from ..poses.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
 from ..system.errors import InputError
 from ..system.jobs.threads import Stopwatch, Workers
 from ..together.bundle import Posed, localize_bundle
-from ..together.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
 from ..together.members import check_photos
 from .photo_reader import PhotoReader
 

@@ -14,14 +14,26 @@ from ..system.files.atomic import check_output
 from ..system.files.line_file import Journal
 from ..system.jobs.threads import Workers
 from ..together.coloring.color_scan import (
+    LEAST_COLORING_PHOTOS,
     OF_RESULTS,
+    PAINTED,
     Coloring,
     check_files,
     check_suffix,
     color_if_enough,
     localize_for_colors,
+    write_colored_scan,
 )
 from .scan_photo import Asked
+
+__all__ = [
+    "LEAST_COLORING_PHOTOS",
+    "PAINTED",
+    "check_suffix",
+    "color_by",
+    "color_if_enough",
+    "write_colored_scan",
+]
 
 
 def color_by(

@@ -14,13 +14,14 @@ from ..localization.places import add_places
 from ..photo.panorama import Panorama, read_panorama
 from ..photo.panorama.facts import read_photo_facts, sha256_of
 from ..photo.photo import File, Photo, as_photo
+from ..poses.times import check_times
 from ..problem.problem import Problem
 from ..system.arguments import check_kind
 from ..system.arrays import Bytes
 from ..system.errors import InputError
 from ..system.files.json_file import reading_once
 from ..system.jobs.threads import Progress, Stopwatch, no_progress
-from ..together.walk.frames import Frame, check_times
+from ..together.walk.frames import Frame
 from ..together.walk.path import believe
 from ..together.walk.results import describe_frame, make_localization, make_localizations
 from ..together.walk.tracker import Tracker

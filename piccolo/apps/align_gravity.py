@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..api.scan import Scan
+from ..api.opening import scan_of
+from ..api.values import LOCALIZED, CoarseToFineSettings
 from ..cli.command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from ..cli.options import add_cloud_options
 from ..cli.settings import cloud_settings_from
@@ -15,13 +16,10 @@ from ..cloud.settings import CloudSettings, R_z_from_axis
 from ..cloud.stream import CloudStream, open_cloud
 from ..cloud.writers import describe_unit, write_transformed
 from ..geometry.pose import orthonormal, rotation_to_z, yaw_rotation
-from ..judge.probability import LOCALIZED
 from ..photo.panorama import read_panorama
-from ..problem.settings import CoarseToFineSettings
-from ..scan_map.scan_map import prepare_map
 from ..system.arrays import Array
 from ..system.files.atomic import is_stream, write_atomically
-from ..system.jobs.threads import Workers, num_cores
+from ..system.jobs.threads import Stopwatch, Workers, num_cores
 
 EXIT_UNKNOWN = 1
 EPILOG = """\
@@ -78,8 +76,7 @@ def find_up_by_photo(photo: Path, cloud: CloudStream, axis: Array) -> tuple[Arra
     """Return up (3,) by a photo, localized in the scan turned by its vertical; None if it isn't; and why."""
     workers = Workers(num_cores(), cloud.show)
     settings = CoarseToFineSettings(gravity="unknown")
-    scan_map = prepare_map(cloud, workers, rotation_to_z(axis))
-    scan = Scan(scan_map, cloud.label, CloudSettings(), settings, workers, {})
+    scan = scan_of(cloud, cloud.label, CloudSettings(), settings, workers, Stopwatch(), rotation_to_z(axis))
     result = scan.localize(photo)
     up = result.pose.R_cam_from_world[2] if result.pose and result.status == LOCALIZED else None
     return up, f"{photo} is {result.status}"

@@ -4,12 +4,11 @@ from argparse import ArgumentParser
 
 from ..api.opening import open_files
 from ..api.result_files import read_results
+from ..api.scan_coloring import check_suffix, write_colored_scan
+from ..api.values import CoarseToFineSettings
 from ..cli.command import Arguments, check_outputs, checking_options, command, option
 from ..cli.options import CACHE_TEXT, add_cloud_options
 from ..cli.settings import cache_from, cloud_settings_from
-from ..problem.settings import CoarseToFineSettings
-from ..scan_map.scan_map import ScanMap
-from ..together.coloring.color_scan import check_suffix, write_colored_scan
 
 EPILOG = """\
 examples:
@@ -43,10 +42,8 @@ def main(arguments: Arguments) -> int:
     method = CoarseToFineSettings()
     scan = open_files(arguments.cloud, settings, method, cache_from(arguments), arguments.workers())
     arguments.warn(scan.warnings)
-    assert isinstance(scan.prepared, ScanMap)
-    colored = write_colored_scan(
-        arguments.cloud, scan.prepared, settings, results, arguments.out, scan.workers
-    )
+    scan_map, _ = scan.require_default_method("colours", method)
+    colored = write_colored_scan(arguments.cloud, scan_map, settings, results, arguments.out, scan.workers)
     line = {"out": str(arguments.out), "photos": colored.num_photos, "points": colored.num_points}
     line["colored_points"] = colored.num_colored
     arguments.report({}, line)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..api.opening import open_points
 from ..api.result_files import read_results
 from ..cli.command import Arguments, check_distinct, check_suffix, checking_options, command, option
 from ..cli.options import add_cloud_options
@@ -16,7 +17,7 @@ from ..geometry.points import LocalCloud
 from ..geometry.pose import CAMERA_AXES, Pose, R_cam_from_angles, check_pose, check_transform
 from ..photo.camera import Camera, Mount
 from ..photo.camera.calibration import read_calibration
-from ..scan_map.open_map import open_points
+from ..photo.panorama.picture import encode_image
 from ..system.arrays import Array32
 from ..system.errors import InputError
 from ..system.files.atomic import (
@@ -28,7 +29,7 @@ from ..system.files.atomic import (
 )
 from ..system.files.json_file import read_text
 from ..system.jobs.threads import Workers
-from ..views.pictures import cut_view, encode_image, fill_holes, sphere_width_for
+from ..views.pictures import cut_view, fill_holes, sphere_width_for
 from ..views.surfels import render_points
 
 EPILOG = """\

@@ -5,15 +5,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..judge.result import Result
+from ..api.values import Result
 from ..system.jobs.cluster import Cluster
 from ..system.jobs.interruption import Interruption
 from ..system.jobs.processes import Here, Processes, WorkerLostError
-from ..together.second_looks import Change, Look, revise
+from ..together.second_looks import LISTINGS, Change, Look, follow_cameras, revise
 from .localizer import Answer, Localizer, Task
 
 Executor = Here | Processes | Cluster
 Show = Callable[[Iterable[Any]], Iterable[Any]]  # wraps what is at work
+
+
+def follow_all(results: list[Result], min_confidence: float) -> Iterator[tuple[Change, Answer]]:
+    """Change results in their list by what all photos of a camera say; yield each change and its answer."""
+    for change in follow_cameras(results, min_confidence):
+        yield change, Answer(change.after, change.after.warnings)
+
+
+def count_looks(results: Sequence[Result]) -> int:
+    """Return how many photos are to be looked at again."""
+    return sum(len(list_looks(results)) for list_looks in LISTINGS)
 
 
 @dataclass(frozen=True)

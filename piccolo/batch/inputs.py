@@ -1,4 +1,4 @@
-"""Inputs of a batch: photos by files, folders and names; when they were taken; what is known beforehand."""
+"""Inputs of a batch: photos by files, folders and names, and what is known of them beforehand."""
 
 import codecs
 import csv
@@ -8,25 +8,19 @@ import re
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, TextIO
 
 from ..photo.panorama.cube import is_cube
-from ..photo.panorama.facts import read_photo_facts
 from ..photo.photo import Photo, Prior, Vector
 from ..scan_map.scan_map import ScanMap, check_within
-from ..system.arguments import EXIF, NAMES, ORDER, PICTURES
+from ..system.arguments import PICTURES
 from ..system.errors import InputError, printable
 from ..system.files.json_file import read_bytes, read_text
-from ..together.walk.frames import check_times
 
 STDIN = "-"
 WANTED_LIST = "wanted a text file, a photo's path on each line"
 MAX_KINDS = 5  # of files left out that are named
-NUMBER = re.compile(r"\d+(?:\.\d+)?")
-WANTED_TIMES = "wanted a CSV file whose first line is name,time: frames by path or file name, and seconds"
 GRAVITY = ("gravity_x", "gravity_y", "gravity_z")
 COLUMNS = ("x", "y", "z", "radius", "heading", "tolerance", "height", *GRAVITY, "within")
 NOT_WITHOUT = {"x": "y", "y": "x", "z": "x", "radius": "x", "tolerance": "heading"}
@@ -112,70 +106,6 @@ def describe_left_out(left_out: Counter[str]) -> str:
         kinds.append(("of other kinds", rest))
     listed = ", ".join(f"{count} {printable(kind) or 'without a suffix'}" for kind, count in kinds)
     return f"{left_out.total()} files left out: {listed}" if kinds else ""
-
-
-def times_of(frames: Sequence[Path], source: str | None) -> list[float] | None:
-    """Seconds of each frame, by the clock of its source; None where only their order counts.
-
-    By EXIF, by the last number in each name, or by a table; without a source by EXIF if it tells the times of
-    all frames, one after another. Raises InputError if the source lacks a frame, or its times do not rise.
-    """
-    if source == ORDER:
-        return None
-    if source in (None, EXIF):
-        times = exif_times(frames)
-        if source is None and not (times and all(a < b for a, b in pairwise(times))):
-            return None
-        if times is None:
-            raise InputError("`times` exif: found a frame without a time in EXIF, wanted one in all")
-    elif source == NAMES:
-        times = [_number_in(frame) for frame in frames]
-    else:
-        times = _times_in(Path(str(source)), frames)
-    check_times(times)
-    return times
-
-
-def exif_times(frames: Sequence[Path]) -> list[float] | None:
-    """Seconds by EXIF; None if one has none, or can't be read.
-
-    Times without an offset from UTC count as they are: in a guessed time zone an hour may come twice. If only
-    some have one, none counts.
-    """
-    times: list[datetime] = []
-    for frame in frames:
-        try:
-            text = read_photo_facts(frame).capture_time
-        except (OSError, InputError):
-            return None
-        if text is None:
-            return None
-        times.append(datetime.fromisoformat(text))
-    if not all(time.tzinfo for time in times):
-        times = [time.replace(tzinfo=UTC) for time in times]
-    return [time.timestamp() for time in times]
-
-
-def _number_in(frame: Path) -> float:
-    found = NUMBER.findall(frame.stem)
-    if not found:
-        raise InputError(f"`times` names: found no number in {frame.name}, wanted seconds in each name")
-    return float(found[-1])
-
-
-def _times_in(path: Path, frames: Sequence[Path]) -> list[float]:
-    rows = csv.DictReader(read_text(path, WANTED_TIMES).splitlines())
-    try:
-        by_name = {row["name"]: float(row["time"]) for row in rows}
-    except (KeyError, ValueError, TypeError, csv.Error) as error:
-        raise InputError(f"{path}: found {type(error).__name__} {error}, {WANTED_TIMES}") from error
-    times = []
-    for frame in frames:
-        time = by_name.get(str(frame), by_name.get(frame.name))
-        if time is None:
-            raise InputError(f"{path}: found no time of {frame}, {WANTED_TIMES}")
-        times.append(time)
-    return times
 
 
 @dataclass(frozen=True)
@@ -264,7 +194,7 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
 
 def _read_positions(path: Path, general: Prior) -> PriorTable | None:
     """Return priors by the positions in a table of given poses; None if it is none, or a table of priors."""
-    from .pose_table import read_pose_table  # noqa: PLC0415  # it imports scipy, which takes long
+    from ..poses.pose_table import read_pose_table  # noqa: PLC0415  # it imports scipy, which takes long
 
     try:
         table = read_pose_table(path)

@@ -16,12 +16,10 @@ from ..api.scan import Scan
 from ..api.scan_bundle import AskedPosed, localize_posed
 from ..api.scan_group import OF_RESULTS, AskedTogether, localize_photos_together
 from ..api.scan_walk import Walk
-from ..geometry.pose import Pose
-from ..judge.result import FAILED, UNREADABLE, Result
-from ..localization.means import Step, Trace
+from ..api.values import FAILED, UNREADABLE, CoarseToFineSettings, Pose, Result, Step, Trace
 from ..photo.panorama.facts import sha256_of
 from ..photo.photo import Photo
-from ..problem.settings import CoarseToFineSettings
+from ..poses.relative_poses import find_scale, read_relative_poses
 from ..scan_map.scan_map import ScanMap
 from ..system.errors import InputError
 from ..system.files.atomic import STDOUT, is_stream, write_lines
@@ -31,7 +29,6 @@ from ..system.jobs.processes import InFlight, Pair
 from ..system.jobs.threads import Progress, Stopwatch
 from ..together.coloring import color_scan
 from .localizer import Localizer, rename
-from .relative_poses import find_scale, read_relative_poses
 from .results_file import WAYS, Records
 
 NUM_TRIED = 3  # frames that can't be read for one reason, and the last: then none can

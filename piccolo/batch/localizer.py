@@ -15,14 +15,11 @@ from ..api.scan import Scan
 from ..api.scan_group import AskedTogether, localize_photos_together
 from ..api.scan_photo import Asked
 from ..api.second_look import Others
-from ..cloud.settings import CloudSettings
-from ..judge.result import Result
-from ..judge.result_parts import Source
-from ..localization.means import Step, Trace
+from ..api.values import CloudSettings, CoarseToFineSettings, Result, Source, Step, Trace
 from ..photo.camera import Calibration
 from ..photo.panorama import read_panorama
+from ..photo.panorama.picture import encode_image
 from ..photo.photo import Photo, Vector
-from ..problem.settings import CoarseToFineSettings
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
 from ..system.files.atomic import temporary_folder, write_temporary
@@ -32,7 +29,7 @@ from ..system.jobs.memory import limit_memory
 from ..system.jobs.processes import WorkerLostError
 from ..system.jobs.threads import Workers
 from ..together.second_looks import Look, localize_in_order
-from ..views.pictures import encode_image, overlay_png
+from ..views.pictures import overlay_png
 from .inputs import PriorTable
 
 

@@ -7,7 +7,7 @@ from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from ..judge.result import FAILED, FORMAT, Result
+from ..api.values import FAILED, FORMAT, Result
 from ..system.errors import InputError
 from ..system.files.line_file import LineFile, whole_lines, whole_size
 from ..together.second_looks import may_change

@@ -10,12 +10,9 @@ from tempfile import TemporaryDirectory
 from tqdm import tqdm
 
 from ..api.scan import Scan
+from ..api.values import AMBIGUOUS, FAILED, LOCALIZED, UNREADABLE, WORTH_A_LOOK, Result
 from ..batch.answering import Executor
 from ..batch.localizer import Localizer
-from ..evidence.focal_length import WIDE
-from ..judge.probability import AMBIGUOUS, LOCALIZED
-from ..judge.result import FAILED, UNREADABLE, Result
-from ..judge.sure import WORTH_A_LOOK
 from ..scan_map.map_file import save_map
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.scan_map import ScanMap
@@ -48,11 +45,7 @@ def advise(result: Result) -> list[str]:
     if result.hint:
         return [f"  {for_terminal(result.hint)}"]
     focal = result.focal_length
-    if (
-        result.place_probability >= WORTH_A_LOOK
-        and focal is not None
-        and focal.given_std_px > WIDE * focal.given_px
-    ):
+    if result.place_probability >= WORTH_A_LOOK and focal is not None and focal.is_guess:
         return ["  if other photos of this camera are localized, repeat with --focal, the mean of theirs"]
     if result.status == AMBIGUOUS:
         return ["  to decide, give --near or --heading, or localize several photos of a walk (--walk)"]

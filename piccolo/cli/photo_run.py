@@ -15,19 +15,27 @@ from typing import Any
 import numpy as np
 
 from ..api.scan import Scan
-from ..batch.answering import Answering
+from ..api.values import (
+    AMBIGUOUS,
+    FAILED,
+    LOCALIZED,
+    NOT_LOCALIZED,
+    UNREADABLE,
+    Change,
+    CoarseToFineSettings,
+    Result,
+    Step,
+)
+from ..batch.answering import Answering, count_looks, follow_all
 from ..batch.inputs import describe_left_out, is_from_stdin, list_panoramas, read_priors
 from ..batch.localizer import Answer, Localizer
 from ..batch.results_file import FileOutput, Output, Records, StreamOutput
-from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
-from ..judge.result import FAILED, UNREADABLE, Result
-from ..localization.means import Step
 from ..photo.panorama import read_panorama
 from ..photo.panorama.cube import is_cube
 from ..photo.panorama.facts import sha256_of
 from ..photo.panorama.masks import find_mask
+from ..photo.panorama.picture import encode_image
 from ..photo.photo import Photo
-from ..problem.settings import CoarseToFineSettings
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
 from ..system.arguments import PICTURES
@@ -44,8 +52,6 @@ from ..system.files.line_file import open_locked, write_line
 from ..system.jobs.interruption import Interruption, interruptible
 from ..system.jobs.memory import limit_memory
 from ..system.jobs.threads import Stopwatch, num_cores
-from ..together.second_looks import LISTINGS, Change, follow_cameras
-from ..views.pictures import encode_image
 from . import execution, terminal, together
 from .command import Arguments, UsageError, check_distinct, check_suffix, checking_options
 from .options import check_arguments
@@ -256,8 +262,8 @@ def record_change(run: Run, change: Change, answer: Answer, output: Output) -> N
 
 def follow_all_cameras(run: Run, results: list[Result], output: Output) -> None:
     """Change results by what all photos of a camera say of its focal length."""
-    for change in follow_cameras(results, run.localizer.settings.min_confidence):
-        record_change(run, change, Answer(change.after, change.after.warnings), output)
+    for change, answer in follow_all(results, run.localizer.settings.min_confidence):
+        record_change(run, change, answer, output)
 
 
 def look_again(run: Run, answering: Answering, output: Output) -> Interruption:
@@ -373,11 +379,11 @@ def localize_photos(arguments: Arguments) -> int:
             output.begin()
         results = output.results() if first is None and run.looks_again else []
         follow_all_cameras(run, results, output)
-        looks = [look for list_looks in LISTINGS for look in list_looks(results)]
-        if first is None and not looks:
+        num_looks = count_looks(results)
+        if first is None and not num_looks:
             arguments.note(f"{arguments.out or 'nothing'}: nothing is left to do")
             return finish(run, records, output, Interruption(), 0.0)
-        num_jobs = execution.count_jobs(arguments, num_left or len(looks) or None)
+        num_jobs = execution.count_jobs(arguments, num_left or num_looks or None)
         opening = partial(open_scan, run)
         with (
             execution.connecting(arguments) as cluster,

@@ -7,12 +7,10 @@ from typing import Any, get_args, get_type_hints
 
 from ..api.photo_reader import Settings
 from ..api.scan import ONLY_DEFAULT
+from ..api.values import Accuracy, CoarseToFineSettings, PaperSettings
 from ..batch.localizer import Localizer
 from ..cloud.settings import CloudSettings
-from ..localization.paper import PaperSettings
 from ..photo.photo import NOTHING_KNOWN, Photo, Prior
-from ..problem.accuracy import Accuracy
-from ..problem.settings import CoarseToFineSettings
 from ..scan_map.open_map import CachePolicy
 from ..system.errors import InputError
 from .command import Arguments

@@ -8,9 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+from ..api import scan_coloring
 from ..api.scan import Scan
 from ..api.scan_walk import Walk
-from ..batch.inputs import is_from_stdin, times_of
+from ..api.values import MOST_IN_SERIES, Motion, Result
+from ..batch.inputs import is_from_stdin
 from ..batch.jobs import (
     Job,
     WalkInput,
@@ -24,17 +26,14 @@ from ..batch.jobs import (
     steps_file,
 )
 from ..batch.localizer import Localizer
-from ..batch.relative_poses import read_odometry
-from ..judge.result import Result
 from ..photo.panorama.facts import sha256_of
 from ..photo.panorama.video import choose_distinct, frames_of_chapters
 from ..photo.photo import Photo
+from ..poses.relative_poses import read_odometry
+from ..poses.times import times_of
 from ..system.files.atomic import temporary_folder
 from ..system.jobs.interruption import Interruption
 from ..system.jobs.processes import Pair
-from ..together.coloring import color_scan
-from ..together.series import MOST_IN_SERIES
-from ..together.walk.frames import Motion
 from . import terminal
 from .command import Arguments, UsageError
 from .execution import EXIT_SOME_NOT, choose_exit_code, print_result, stop
@@ -94,7 +93,7 @@ def check_joint_options(arguments: Arguments) -> None:
         option = "--walk" if a.walk else "--together" if a.together else "--color-scan"
         raise UsageError(f"{option}: found names on stdin, wanted files or folders")
     if a.color_scan:
-        color_scan.check_suffix(a.color_scan)
+        scan_coloring.check_suffix(a.color_scan)
     Motion(max_speed=a.max_speed)  # refuses a wrong one
 
 
@@ -198,15 +197,15 @@ def ask_for_coloring(
     out = arguments.color_scan
 
     def report(results: Sequence[Result]) -> tuple[str, bool]:
-        of_scan = {*scan.warnings, color_scan.PAINTED}
+        of_scan = {*scan.warnings, scan_coloring.PAINTED}
         for result in results:
             print_result(arguments, result, [w for w in result.warnings if w not in of_scan])
         scan_map, _ = scan.require_default_method("colours", scan.settings)
-        colored = color_scan.color_if_enough(
+        colored = scan_coloring.color_if_enough(
             localizer.paths, scan_map, scan.cloud_settings, list(results), out, scan.workers
         )
         if not colored.num_points:
-            least = color_scan.LEAST_COLORING_PHOTOS
+            least = scan_coloring.LEAST_COLORING_PHOTOS
             return f"; {out} is not written: wanted {least} localized photos or more", False
         part = 100.0 * colored.num_colored / colored.num_points
         return f"; {part:.0f} % of the points coloured", True

@@ -74,17 +74,6 @@ class Patches(NamedTuple):
     gap: Array  # (P,) [m] its distance
 
 
-def gap_variance(motion: Array, place: Array, reach: float) -> float:
-    """Return the variance [m^2] of a position at a place (3,) along any axis by layers with a motion (3, 3).
-
-    It is a twelfth, as of a uniform density between both layers, of their mean square distance within reach
-    [m]: a pose may follow one layer in some directions and the other in others.
-    """
-    middle, turn, move = motion
-    gap = move + np.cross(turn, place - middle)
-    return float(gap @ gap + reach**2 * (turn @ turn)) / 12.0
-
-
 def describe_layers(layers: Layers, place_world: Array) -> str:
     """Describe layers in a warning; most apart they are near a place (3,) of the world."""
     turn = np.degrees(np.linalg.norm(layers.motion[1]))

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..geometry.points import LocalCloud, pack_points
 from ..geometry.pose import rotate_points
 from ..system.arrays import Array, Array32, Bytes, Floats, Values
 from ..system.errors import InputError
@@ -64,6 +65,10 @@ class Cloud:
     warnings: tuple[str, ...] = ()  # one line each, for the user
     up: UpAxis = "z"  # the axis that points up according to the files
     has_colors: bool = True  # else greys, by the intensity or all alike
+
+    def pack(self) -> LocalCloud:
+        """Return the points as kernels read them."""
+        return LocalCloud(np.eye(3), self.origin_world, pack_points(self.points, self.colors), self.warnings)
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,8 @@ from functools import lru_cache
 import numpy as np
 
 from ..geometry.pose import Pose
-from ..geometry.sphere import BLOCK_RINGS, find_cell, make_grid, pixel_rays
+from ..geometry.sphere import BLOCK_RINGS, NUM_BLOCKS, find_cell, make_grid, pixel_rays
 from ..judge.candidate import CONTRADICTS, Comparison, Unoccluded
-from ..optimize.channel_loss import NUM_BLOCKS
 from ..photo.panorama.local_normalization import opponent, zscore
 from ..photo.panorama.texels import TEXEL_CHUNK, Texels, make_chunk, project, sample
 from ..problem.problem import Problem

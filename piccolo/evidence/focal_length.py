@@ -21,7 +21,7 @@ from ..judge.belief import UNCONFIRMED
 from ..judge.candidate import Candidate
 from ..judge.claim import Claim, marginal
 from ..judge.consensus import WRONG_DEVIATION, WRONG_SHARE, Opinion
-from ..judge.result_parts import FocalLength
+from ..judge.result_parts import WIDE, FocalLength
 from ..local_features.matching import NO_MATCHES, Matches
 from ..photo.camera import Camera
 from ..photo.camera.corrections import FOCAL, LENS, Corrections
@@ -49,7 +49,6 @@ from .self_calibration import (
 )
 from .verification import draw_near
 
-WIDE = 0.05  # a focal length with a larger deviation is a guess: k1 is fitted too
 K1_DEVIATION = 0.05  # of k1 where the camera is a guess
 FITTED = [FOCAL, LENS.index("radial")]  # corrections that the camera takes; the others widen the covariance
 # deviations of the other corrections: of a calibration, and of a focal length alone

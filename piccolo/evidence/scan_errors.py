@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from ..cloud.layers import gap_variance
 from ..geometry.pose import Pose
 from ..scan_map.scan_map import ScanMap
 from ..system.arrays import Array
@@ -41,3 +40,14 @@ def displacement_variance(scan_map: ScanMap, pose: Pose, acting_range: float) ->
     """Return the covariance (3, 3) [m^2], in the map's axes, by which surfaces lie beside where they are."""
     common = scan_covariance(scan_map, acting_range) + layer_covariance(scan_map, pose, acting_range)
     return common[3:, 3:] + scan_map.displacement**2 * np.eye(3)
+
+
+def gap_variance(motion: Array, place: Array, reach: float) -> float:
+    """Return the variance [m^2] of a position at a place (3,) along any axis by layers with a motion (3, 3).
+
+    It is a twelfth, as of a uniform density between both layers, of their mean square distance within reach
+    [m]: a pose may follow one layer in some directions and the other in others.
+    """
+    middle, turn, move = motion
+    gap = move + np.cross(turn, place - middle)
+    return float(gap @ gap + reach**2 * (turn @ turn)) / 12.0

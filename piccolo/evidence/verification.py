@@ -29,11 +29,11 @@ from ..local_features.matching import (
     pair,
 )
 from ..local_features.perspective_view import PerspectiveView, add_margin
-from ..local_features.view_image import ViewImage, render_gray
 from ..problem.method import Method
 from ..problem.problem import Problem
 from ..system.arrays import Array, Array32, Bytes
 from ..system.jobs.threads import Workers
+from ..views.view_image import ViewImage, render_gray
 from .occlusion import EXPLAINED, occlusion_mask
 
 PLACE = 0.1  # [m] the scan is drawn at positions on a grid of this spacing

@@ -38,6 +38,7 @@ A4 = np.float32(0.07962366193533)
 A5 = np.float32(-0.03360421210527)
 A6 = np.float32(0.00681171109960)
 BLOCK_RINGS = 6  # of the blocks of 30 degrees in which a score is taken
+CHANCE_CORRELATION = 0.35  # of a block, that wrong poses reach
 SEARCH_RINGS = 24  # of the views that are searched: cells of 7.5 degrees
 AREA_UNITS = 1000  # of the largest cell
 
@@ -156,6 +157,9 @@ def make_grid(num_rings: int) -> SphereGrid:
         solid_angle.append(np.full(n, 0.5 * (np.sin(edges[ring]) - np.sin(edges[ring + 1])) / n))
     all_directions = np.concatenate(directions).astype(np.float32)
     return SphereGrid(num_columns, first, all_directions, np.concatenate(solid_angle).astype(np.float32))
+
+
+NUM_BLOCKS = len(make_grid(BLOCK_RINGS))
 
 
 @lru_cache(maxsize=8)

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..geometry.pose import Pose
+from ..geometry.sphere import CHANCE_CORRELATION, NUM_BLOCKS
 from ..local_features.matching import Matches
-from ..optimize.channel_loss import CHANCE_CORRELATION, NUM_BLOCKS
 from ..problem.photo_images import PhotoImages
 from ..system.arrays import Array, Mask
 from .reasons import Contradiction

@@ -3,8 +3,8 @@
 import math
 from dataclasses import replace
 
+from ..geometry.points import MapFrame
 from ..geometry.pose_gaussian import PoseGaussian
-from ..scan_map.scan_map import ScanMap
 from .belief import Belief
 from .case import Case, Geometry
 from .consensus import MOST_CONFLICT, Opinion
@@ -27,7 +27,7 @@ OTHERS = {  # corrections of a lens besides its focal length, in words
 TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported
 
 
-def conclude(scan_map: ScanMap, case: Case, belief: Belief, min_confidence: float) -> Result:
+def conclude(frame: MapFrame, case: Case, belief: Belief, min_confidence: float) -> Result:
     """Return the result in the world for a case and a belief, with what rules the pose out."""
     measured = case.measured
     geometry = case.geometry
@@ -41,15 +41,15 @@ def conclude(scan_map: ScanMap, case: Case, belief: Belief, min_confidence: floa
         warnings.append(explain_conflict(geometry))
     gaussian, std_of_fit = measured.errors
     alternatives = [
-        Alternative(scan_map.to_world(h.pose), h.score, s.num_matches)
+        Alternative(frame.to_world(h.pose), h.score, s.num_matches)
         for h, s in zip(case.found.alternatives, case.standings[1:], strict=True)
     ]
     described = Result(
-        best_pose=scan_map.to_world(measured.pose),
+        best_pose=frame.to_world(measured.pose),
         loss=measured.loss,
         evidence=measured.evidence,
         alternatives=tuple(alternatives),
-        covariance=describe_errors(gaussian, scan_map.R_map_from_world.T),
+        covariance=describe_errors(gaussian, frame.R_map_from_world.T),
         cameras=() if geometry is None else geometry.cameras,
         focal_length=geometry and geometry.focal_length,
         sphere=geometry and geometry.sphere,
@@ -90,10 +90,10 @@ def contradict(who_has: str, focal: FocalLength, px: float) -> str:
     return f"{who_has} a focal length of {px:.0f} px, not {focal.given_px:.0f}: check {focal.source}"
 
 
-def take_pose(judged: Result, fused: PoseGaussian, scan_map: ScanMap) -> Result:
+def take_pose(judged: Result, fused: PoseGaussian, frame: MapFrame) -> Result:
     """Return a result with another pose of the same place."""
-    described = describe_errors(fused, scan_map.R_map_from_world.T)
-    return replace(judged, best_pose=scan_map.to_world(fused.pose), covariance=described, gaussian=fused)
+    described = describe_errors(fused, frame.R_map_from_world.T)
+    return replace(judged, best_pose=frame.to_world(fused.pose), covariance=described, gaussian=fused)
 
 
 def explain_doubts(geometry: Geometry, status: str) -> tuple[str, ...]:

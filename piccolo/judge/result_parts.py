@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from ..geometry.pose import Pose
 from .consensus import Opinion
 
+WIDE = 0.05  # a focal length with a larger deviation is a guess: k1 is fitted too
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -53,6 +55,11 @@ class FocalLength:
     def prior_deviation(self) -> float:
         """Standard deviation of the logarithm of what was given."""
         return self.given_std_px / self.given_px
+
+    @property
+    def is_guess(self) -> bool:
+        """True if what was given is hardly more than a guess."""
+        return self.prior_deviation > WIDE
 
     @property
     def opinion(self) -> Opinion | None:

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
-from ..evidence.focal_length import WIDE
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..judge.alternatives import MAX_ALTERNATIVES
@@ -15,7 +14,7 @@ from ..judge.candidate import Candidate, Selection
 from ..judge.probability import LOCALIZED
 from ..judge.reasons import Reason
 from ..judge.result import Result, nothing_found
-from ..judge.result_parts import Alternative, FocalLength
+from ..judge.result_parts import WIDE, Alternative, FocalLength
 from ..judge.selection import is_faint, rank
 from ..photo.panorama import Panorama
 from ..photo.panorama.edges import find_axes

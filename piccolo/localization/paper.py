@@ -6,10 +6,9 @@ from typing import Literal
 
 import numpy as np
 
-from ..cloud.stream import Cloud
 from ..evidence.occlusion import compare_occlusion, measure_agreement
 from ..geometry.nearness import Nearness
-from ..geometry.points import LocalCloud, PackedPoints, pack_points
+from ..geometry.points import LocalCloud, PackedPoints
 from ..geometry.pose import Gravity, Pose, uniform_rotations, uniform_yaws
 from ..geometry.sphere import solid_angles
 from ..judge.alternatives import Hypothesis, alternative_poses, best_distinct
@@ -17,7 +16,6 @@ from ..judge.belief import Belief, make_belief
 from ..judge.probability import LEAST_LOGIT_SCORE
 from ..judge.result import Result, nothing_found
 from ..judge.result_parts import Alternative, Evidence
-from ..optimize.refine import DescentSettings, Loss, Refined, make_sampling_loss, refine
 from ..photo.panorama import Panorama
 from ..photo.panorama.model import shrink
 from ..photo.panorama.texels import pack_texels
@@ -27,6 +25,7 @@ from ..system.arrays import Array, Array32, Mask
 from ..system.errors import InputError
 from ..system.jobs.threads import Stopwatch, Workers
 from ..views.zbuffer import is_free_space, render_view, visible_points
+from .paper_descent import DescentSettings, Loss, Refined, make_sampling_loss, refine
 
 # No covariance is known here, and too few alternatives to tell places that repeat: a rough guide, by margin
 # and log of the agreement, learnt without such places.
@@ -165,11 +164,11 @@ class PaperMap(LocalCloud):
     scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
 
 
-def prepare(cloud: Cloud, settings: PaperSettings) -> PaperMap:
+def prepare(cloud: LocalCloud, settings: PaperSettings) -> PaperMap:
     """Prepare everything that does not depend on the panorama."""
-    points = pack_points(cloud.points, cloud.colors).subsample(settings.max_points)
+    points = cloud.points.subsample(settings.max_points)
     positions = free_grid(points, settings.num_translations, settings.grid_margin)
-    return PaperMap(np.eye(3), cloud.origin_world, points, cloud.warnings, positions)
+    return PaperMap(cloud.R_map_from_world, cloud.origin_world, points, cloud.warnings, positions)
 
 
 def search(

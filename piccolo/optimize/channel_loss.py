@@ -11,17 +11,15 @@ import numpy as np
 
 from ..geometry.levenberg_marquardt import COUNT_SUM, LOSS, levenberg_marquardt
 from ..geometry.robust import inline_geman_mcclure
-from ..geometry.sphere import BLOCK_RINGS, make_grid
+from ..geometry.sphere import CHANCE_CORRELATION, NUM_BLOCKS
 from ..photo.panorama.local_normalization import ZERO_LEVEL
 from ..photo.panorama.texels import TEXEL_CHUNK, make_chunk, project, sample
 from ..system.arrays import Array, Array32, Int32s, Int64s
 from ..system.kernels.jit import Scalar, inline_kernel, kernel
 from .normal_equations import block_adder
 
-NUM_BLOCKS = len(make_grid(BLOCK_RINGS))
 NUM_MOMENTS = 10
 FLAT_BLOCK = 6.0  # [levels] a smaller deviation of a block's channels counts as this
-CHANCE_CORRELATION = 0.35  # a block's correlation that wrong poses reach
 ZERO = np.float32(ZERO_LEVEL)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..photo.photo import Prior
-from ..scan_map.camera_positions import COARSE_SPACING, heights_above_floor
+from ..scan_map.camera_positions import COARSE_SPACING, Ball, heights_above_floor
 from ..scan_map.scan_map import ScanMap, candidates_within
 from ..system.arrays import Array, Mask
 
@@ -21,6 +21,13 @@ def allow_by_option(scan_map: ScanMap, prior: Prior) -> dict[str, Mask]:
     if prior.within:
         allowed["`within`"] = candidates_within(scan_map, prior.within)
     return allowed
+
+
+def ball_of(prior: Prior) -> Ball | None:
+    """Return the ball of the world in which the camera was; None if the prior does not say that."""
+    if prior.near is None or prior.near[2] is None or prior.radius is None:
+        return None
+    return Ball(np.array(prior.near, float), prior.radius)
 
 
 def distances_to(scan_map: ScanMap, near: tuple[float, float, float | None]) -> Array:

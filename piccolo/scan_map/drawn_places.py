@@ -17,12 +17,12 @@ from ..geometry.vectors import minus, row
 from ..local_features.keypoints import find_keypoints
 from ..local_features.matching import Located
 from ..local_features.perspective_view import cover_sphere
-from ..local_features.view_image import render_gray
 from ..system.arrays import Array, Array32, Int32s, Int64s
 from ..system.jobs.threads import Once, Workers
 from ..system.kernels.jit import kernel, whole
 from ..views.candidate_views import SEARCH_VIEW
 from ..views.view import ranges_around
+from ..views.view_image import render_gray
 
 PICTURE_WIDTH = 640  # [px] of the sphere
 MAX_RANGE = 30.0  # [m] farther away the scan is too thin, and a match hardly constrains the position

@@ -12,7 +12,6 @@ from ..cloud.settings import BY_FILE, IN_COLORS, CloudSettings, R_z_from_axis
 from ..cloud.stream import open_cloud, read_crs
 from ..geometry.points import LocalCloud, pack_points
 from ..geometry.pose import rotate_points
-from ..photo.photo import NOTHING_KNOWN, Prior
 from ..system.errors import InputError
 from ..system.files.cache import (
     cache_root,
@@ -23,6 +22,7 @@ from ..system.files.cache import (
     sha256_of_files,
 )
 from ..system.jobs.threads import Stopwatch, Workers
+from .camera_positions import Ball
 from .map_file import FORMAT, NAME, is_map_file, load_map, save_map
 from .scan_addition import add_scan
 from .scan_map import ScanMap, name_scan, prepare_map
@@ -46,12 +46,12 @@ def open_map(
     cache: CachePolicy,
     workers: Workers,
     watch: Stopwatch,
-    prior: Prior = NOTHING_KNOWN,
+    part: Ball | None = None,
 ) -> ScanMap:
     """Return the map of a cloud's files: prepared already, from the cache, or built now.
 
-    `paths` may be a prepared map instead of a cloud. The prior is used only if the scan is too large as a
-    whole.
+    `paths` may be a prepared map instead of a cloud. A part of the world is prepared only if the scan is
+    too large as a whole.
     """
     map_path = find_prepared_map(paths)
     if map_path:
@@ -70,7 +70,7 @@ def open_map(
         with watch.stage("read"):
             cloud = open_cloud(paths, cloud_settings, workers.show)
         up = cloud_settings.up
-        scan_map = prepare_map(cloud, workers, up, watch, prior=prior)
+        scan_map = prepare_map(cloud, workers, up, watch, part)
         return replace(scan_map, scan_sha256=digest, crs=read_crs(paths))
 
     key = content_key(digest, cloud_settings) if digest else ""

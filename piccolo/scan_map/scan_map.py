@@ -14,7 +14,6 @@ from ..cloud.stream import CloudStream
 from ..cloud.surfaces import displacement, paint_shape, surface_variance
 from ..geometry.points import MapFrame, PackedPoints, pack_points
 from ..geometry.pose import Pose
-from ..photo.photo import NOTHING_KNOWN, Prior
 from ..system.arrays import Array, Bytes, Int8s, Int64s, Mask, Uint16s
 from ..system.errors import InputError
 from ..system.jobs.threads import Stopwatch, Workers
@@ -107,21 +106,21 @@ def sparse_candidates(centers: Array) -> tuple[Int64s, Int64s]:
 
 
 def find_candidates(
-    octree: Octree, R_map_from_world: Array, origin_world: Array, prior: Prior, workers: Workers
+    octree: Octree, R_map_from_world: Array, origin_world: Array, part: Ball | None, workers: Workers
 ) -> tuple[Array, tuple[str, ...]]:
-    """Find candidates (N, 3) [m]; in a scan too large as a whole only near the prior's place, with a warning.
+    """Find candidates (N, 3) [m]; in a scan too large as a whole only in a part of the world, with a warning.
 
     The map's frame is given by R_map_from_world (3, 3) and origin_world (3,) [m].
     """
     try:
         return candidate_centers(octree, workers), ()
     except TooManyPositionsError:
-        if prior.near is None or prior.radius is None:
+        if part is None:
             raise
-    near = R_map_from_world @ (np.array(prior.near) - origin_world)
-    part = f"prepared within {prior.radius:g} m of `near`, for this run only"
-    text = f"the scan is too large as a whole: {part}"
-    centers = candidate_centers(octree, workers, Ball(near, prior.radius))
+    here = f"prepared within {part.radius:g} m of `near`, for this run only"
+    text = f"the scan is too large as a whole: {here}"
+    part_map = Ball(R_map_from_world @ (part.center - origin_world), part.radius)
+    centers = candidate_centers(octree, workers, part_map)
     workers.warn(text)
     return centers, (text,)
 
@@ -131,13 +130,12 @@ def prepare_map(
     workers: Workers,
     up: UpAxis | Array = "auto",
     watch: Stopwatch | None = None,
-    prior: Prior = NOTHING_KNOWN,
+    part: Ball | None = None,
 ) -> ScanMap:
     """Prepare a map of a cloud; of one without colours it holds the edges of the surfaces in their place.
 
     The named axis is up, with `auto` the file's; or a rotation (3, 3) makes z up. Of a scan too large as a
-    whole only the surroundings of the prior's place are prepared; TooManyPositionsError if the prior has no
-    place.
+    whole only a part of the world is prepared; TooManyPositionsError if none is given.
     """
     watch = watch or Stopwatch()
     R_map_from_world = R_z_from_axis(up, cloud.up) if isinstance(up, str) else up
@@ -157,7 +155,7 @@ def prepare_map(
         if has_shape:
             octree = paint_shape(octree, workers)
         layers, found = look_for_layers(octree, R_map_from_world, origin_world, workers)
-        centers, notes = find_candidates(octree, R_map_from_world, origin_world, prior, workers)
+        centers, notes = find_candidates(octree, R_map_from_world, origin_world, part, workers)
         sparse, _ = sparse_candidates(centers)
         wide = render_wide(octree, centers[sparse], SEARCH_VIEW, workers)
         return ScanMap(

@@ -28,12 +28,7 @@ from ..localization.calibration import calibrate
 from ..localization.judging import Found, judge_together
 from ..localization.means import NO_TRACE, Means, Trace
 from ..photo.panorama import Panorama
-from ..problem.accuracy import Demand
-from ..problem.settings import CoarseToFineSettings
-from ..scan_map.scan_map import ScanMap
-from ..system.arrays import Array
-from ..system.jobs.threads import Stopwatch, Workers, one_blas_thread
-from .bundle_adjustment import (
+from ..poses.bundle_adjustment import (
     NUM_ADJUSTMENT_ROUNDS,
     Adjusted,
     Bundle,
@@ -43,15 +38,14 @@ from .bundle_adjustment import (
     estimate_errors,
     find_contradicting,
     find_scale,
-)
-from .bundle_search import (
-    PosedMember,
-    Support,
-    find_supports,
     move_origin_near,
-    propose_bundles,
-    weigh_bundles,
 )
+from ..problem.accuracy import Demand
+from ..problem.settings import CoarseToFineSettings
+from ..scan_map.scan_map import ScanMap
+from ..system.arrays import Array
+from ..system.jobs.threads import Stopwatch, Workers, one_blas_thread
+from .bundle_search import PosedMember, Support, find_supports, propose_bundles, weigh_bundles
 from .members import Member, Shot, find_members
 
 EVEN_ODDS = 0.5

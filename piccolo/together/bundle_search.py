@@ -22,11 +22,11 @@ from ..judge.selection import assess, credit_copies
 from ..localization.copies import list_copies
 from ..localization.ladder import refine
 from ..localization.last_descent import HOPELESS_SCORE
+from ..poses.bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
 from ..problem.problem import Problem
 from ..problem.stages import FINE
 from ..system.arrays import Array
 from ..system.jobs.threads import Workers
-from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
 from .members import Member
 
 MOST_UNSEEN = 1.0 / 3.0  # chosen: of photos, those that may show nothing
@@ -86,12 +86,6 @@ class Support(NamedTuple):
     def shares(self) -> Array:
         """Probabilities (4,) of `weights`."""
         return np.asarray(self.weights / self.weights.sum())
-
-
-def move_origin_near(cams_from_bundle: Sequence[Pose]) -> list[Pose]:
-    """Move the origin of the common frame to the photos' mean position, so that turns hardly move them."""
-    mean = np.mean([pose.center_world for pose in cams_from_bundle], axis=0)
-    return [Pose(pose.R_cam_from_world, pose.center_world - mean) for pose in cams_from_bundle]
 
 
 def propose_bundles(members: Sequence[PosedMember], errors: RelativeErrors) -> list[Bundle]:

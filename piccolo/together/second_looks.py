@@ -13,12 +13,11 @@ from dataclasses import replace
 from hashlib import sha256
 from typing import NamedTuple, TypeVar
 
-from ..evidence.focal_length import WIDE
 from ..judge.conclude import follow_consensus
 from ..judge.consensus import Consensus
 from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..judge.result import Result
-from ..judge.result_parts import Beside, FocalLength
+from ..judge.result_parts import WIDE, Beside, FocalLength
 from ..judge.sure import SURE_CONFIDENCE
 from .series import list_series
 

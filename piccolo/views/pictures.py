@@ -4,7 +4,6 @@ import math
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ..geometry.points import PackedPoints
 from ..geometry.pose import Pose
@@ -12,6 +11,7 @@ from ..geometry.sphere import compute_pixels
 from ..photo.camera import Camera
 from ..photo.panorama import Panorama
 from ..photo.panorama.model import resize
+from ..photo.panorama.picture import encode_image
 from ..system.arrays import Array, Array32, Bytes, Mask
 from ..system.jobs.threads import Workers
 from .surfels import render_points
@@ -49,21 +49,6 @@ def fill_holes(rgb: Bytes, is_seen: Mask) -> Bytes:
     smooth = cv2.resize(around, double, interpolation=cv2.INTER_LINEAR)[:height, 2 : 2 + width]
     np.copyto(smooth, rgb, where=is_seen[..., None])
     return np.asarray(smooth, np.uint8)
-
-
-def encode_image(image: Bytes | NDArray[np.uint16], suffix: str, quality: int = 95) -> bytes:
-    """Return the file, as bytes, of an image (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) gray.
-
-    The suffix, such as ".png", gives the format; `quality`, up to 100, is that of a JPEG. Raises OSError if
-    the image can't be encoded.
-    """
-    order = cv2.COLOR_RGBA2BGRA if image.ndim == 3 and image.shape[2] == 4 else cv2.COLOR_RGB2BGR
-    bgr = cv2.cvtColor(image, order) if image.ndim == 3 else image
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if suffix in (".jpg", ".jpeg") else []
-    is_encoded, content = cv2.imencode(suffix, bgr, options)
-    if not is_encoded:
-        raise OSError(f"an image of {image.shape[1]} x {image.shape[0]} could not be encoded as {suffix}")
-    return content.tobytes()
 
 
 def checkerboard(photo: Bytes, cloud: Bytes) -> Bytes:

@@ -26,11 +26,11 @@ from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import Pose, move, transform_points
 from piccolo.photo.panorama import read_panorama
 from piccolo.photo.panorama.model import shrink
+from piccolo.photo.panorama.picture import encode_image
 from piccolo.system.arrays import Array
 from piccolo.system.errors import InputError, unreadable
 from piccolo.system.files.atomic import check_output_folder, replacing_folder, write_atomically
 from piccolo.system.jobs.threads import Progress, Workers
-from piccolo.views.pictures import encode_image
 
 from ..scene import CLOUD_NAME, QUERIES_NAME, Query, Scene, read_scene, write_queries
 from . import generic, papers

@@ -16,7 +16,7 @@ import numpy as np
 from piccolo import InputError, PaperSettings, Pose
 from piccolo.geometry.points import PackedPoints
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.optimize.refine import Equations, Loss
+from piccolo.localization.paper_descent import Equations, Loss
 from piccolo.photo.panorama import Panorama
 from piccolo.photo.panorama.model import shrink
 from piccolo.system.arrays import Array, Array32, Mask

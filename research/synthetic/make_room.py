@@ -13,10 +13,10 @@ from piccolo.cli.command import Arguments, UsageError, check_folder_name, checki
 from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.photo.camera import Calibration
 from piccolo.photo.camera.calibration import read_cameras
+from piccolo.photo.panorama.picture import encode_image
 from piccolo.system.errors import import_optional
 from piccolo.system.files.atomic import write_atomically, write_lines
 from piccolo.system.jobs.threads import Workers
-from piccolo.views.pictures import encode_image
 
 from .. import scene as scenes
 from . import world as worlds

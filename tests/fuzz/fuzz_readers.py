@@ -13,7 +13,6 @@ import atheris
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from piccolo.batch.inputs import read_priors
-from piccolo.batch.relative_poses import read_relative_poses
 from piccolo.cloud.settings import BY_FILE
 from piccolo.cloud.stream import FORMATS
 from piccolo.judge.result import Result
@@ -21,6 +20,7 @@ from piccolo.photo.camera.calibration import read_cameras, read_rig
 from piccolo.photo.panorama import read_panorama
 from piccolo.photo.panorama.facts import read_photo_facts
 from piccolo.photo.photo import Prior
+from piccolo.poses.relative_poses import read_relative_poses
 from piccolo.scan_map.map_file import load_map
 from piccolo.system.errors import InputError
 from research.scene import read_scene

@@ -6,11 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ...api.result_files import check_scan, read_results
+from ...api.result_files import check_scan, digest_of_scan, read_results
+from ...api.values import Result
 from ...cli.command import Arguments, check_distinct, checking_options, command, option
 from ...geometry.pose import CAMERA_AXES
-from ...judge.result import Result
-from ...scan_map.open_map import CachePolicy, scan_sha256_of
 from ...system.errors import InputError
 from .faces import FACES
 from .formats import FORMATS, export
@@ -104,7 +103,7 @@ def check_content(arguments: Arguments, results: Sequence[Result]) -> Iterable[s
         paths = [Path(path) for path in ([cloud] if isinstance(cloud, str) else cloud)]
         if all(path.is_file() for path in paths):
             own = [result for result in results if result.cloud == cloud]
-            digest = scan_sha256_of(paths, CachePolicy(True, None))
+            digest = digest_of_scan(paths)
             if note := check_scan(own, digest, own[0].cloud_name, arguments.force):
                 yield note
 

@@ -7,18 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
+from ...api.values import read_as_localized
 from ...geometry.pose import R_cam_from_angles
 from ...geometry.sphere import compute_pixels
-from ...localization.result_photo import read_as_localized
 from ...photo.camera import Camera, Mount
 from ...photo.camera.calibration import rows
 from ...photo.panorama import Panorama
-from ...photo.panorama.picture import WANTED
+from ...photo.panorama.picture import WANTED, encode_image
 from ...system.arrays import Bytes
 from ...system.errors import InputError
 from ...system.files.atomic import write_atomically
 from ...system.files.json_file import read_bytes
-from ...views.pictures import encode_image, sample_sphere
+from ...views.pictures import sample_sphere
 from .posed_images import PosedImage, names_within
 
 CORNER_DEG = math.degrees(math.atan(math.sqrt(0.5)))  # elevation of a cube's corner

@@ -11,10 +11,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from ...api.values import LOCALIZED, Result
 from ...geometry.points import LocalCloud
 from ...geometry.pose import Pose
-from ...judge.probability import LOCALIZED
-from ...judge.result import Result
 from ...photo.camera import Calibration, Camera, Mount
 from ...photo.panorama import panorama_size
 from ...photo.panorama.gpano import check_size

@@ -15,11 +15,10 @@ import numpy as np
 from ...geometry.pose import OPTICAL_FROM_CAM, turn_axes
 from ...photo.camera import Camera
 from ...photo.camera.model import PERSPECTIVE, Distortion
-from ...photo.panorama.picture import read_picture
+from ...photo.panorama.picture import encode_image, read_picture
 from ...system.arrays import Bytes
 from ...system.errors import InputError, import_optional
 from ...system.files.atomic import write_atomically
-from ...views.pictures import encode_image
 from .posed_images import Options, PosedImage
 from .scan_points import find_points
 

@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from msgspec import convert
 
+from ...api.opening import find_prepared_map, open_points
+from ...api.values import Result
 from ...cloud.settings import CloudSettings
 from ...cloud.stream import open_cloud
 from ...geometry.colors import unpack_rgb
 from ...geometry.points import LocalCloud, pack_points
 from ...geometry.pose import Pose, rotate_points
-from ...judge.result import Result
-from ...scan_map.open_map import find_prepared_map, open_points
 from ...system.arrays import Array, Bytes, Int64s, Mask
 from ...system.errors import InputError
 from ...system.jobs.threads import Workers

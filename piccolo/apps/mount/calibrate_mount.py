@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from ...api.result_files import read_results
-from ...batch.inputs import times_of
-from ...batch.pose_table import AHEAD, QUATERNION, PoseTable, read_pose_table
-from ...batch.relative_poses import warn_of_axes
+from ...api.values import Result
 from ...cli.command import Arguments, UsageError, check_outputs, check_suffix, command, option
 from ...geometry.pose import CAMERA_AXES, OPTICAL_FROM_CAM, Pose, angle_between, log_so3, quaternion_wxyz
-from ...judge.result import Result
+from ...poses.pose_table import AHEAD, QUATERNION, PoseTable, read_pose_table
+from ...poses.relative_poses import warn_of_axes
+from ...poses.times import times_of
 from ...system.arrays import Array
 from ...system.errors import InputError
 from ...system.files.photo_names import match_names

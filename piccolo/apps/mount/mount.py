@@ -14,15 +14,15 @@ import numpy as np
 from ...geometry.gauss_newton import Equations, minimize, sum_observations, whiten
 from ...geometry.pose import Pose
 from ...geometry.pose_gaussian import LOOSE, add, subtract
-from ...system.arrays import Array
-from ...system.errors import InputError
-from ...together.bundle_adjustment import (
+from ...poses.bundle_adjustment import (
     RelativeErrors,
     choose_agreed,
     find_odd,
     match_median,
     robustly,
 )
+from ...system.arrays import Array
+from ...system.errors import InputError
 
 LEAST_PHOTOS = 4
 NUM_ROUNDS = 5  # in which errors and the mount are estimated in turn

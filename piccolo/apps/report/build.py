@@ -13,8 +13,10 @@ import numpy as np
 from ... import __version__
 from ...api.result_files import check_scan
 from ...api.scan import Scan
+from ...api.values import FAILED, UNREADABLE, Result
+from ...geometry.points import PackedPoints
 from ...geometry.pose import Pose
-from ...judge.result import FAILED, UNREADABLE, Result
+from ...photo.panorama.picture import encode_image
 from ...photo.photo import File
 from ...scan_map.scan_map import ScanMap
 from ...system.arguments import check_fields, check_kind
@@ -22,7 +24,6 @@ from ...system.errors import InputError
 from ...system.files.atomic import temporary_folder, write_atomically
 from ...system.files.cache import digest_of_sources
 from ...system.jobs.threads import Workers
-from ...views.pictures import encode_image
 from ...views.surfels import MAX_SURFELS, Surfels, make_surfels
 from . import site
 from .photo_folder import PhotoFolder
@@ -159,6 +160,12 @@ def list_poses(result: Result, from_world: Callable[[Pose], Pose]) -> list[Pose]
     return [from_world(pose) for pose in found if pose]
 
 
+def draw_surfels(points: PackedPoints, workers: Workers) -> tuple[Surfels, PackedPoints]:
+    """Return the surfels of a scan, of a part of its points if these are many, and these points."""
+    some = points.subsample(MAX_SURFELS)
+    return make_surfels(some, workers), some
+
+
 def write_pictures(
     tasks: Sequence[Task], scan_map: ScanMap, folder: Path, settings: ReportSettings, workers: Workers
 ) -> tuple[str, ...]:
@@ -168,10 +175,11 @@ def write_pictures(
     todo = list({task.key: task for task in missing}.values())
     if not todo:
         return ()
-    points = scan_map.points.subsample(MAX_SURFELS)
-    is_found = any(task.poses for task in todo)
-    nothing = Surfels(points, np.empty((0, 3), np.float32), np.empty(0, np.float32))
-    scan = (make_surfels(points, workers) if is_found else nothing), points
+    if any(task.poses for task in todo):
+        scan = draw_surfels(scan_map.points, workers)
+    else:
+        points = scan_map.points.subsample(MAX_SURFELS)
+        scan = Surfels(points, np.empty((0, 3), np.float32), np.empty(0, np.float32)), points
 
     def write(task: Task) -> str:
         if task.problem:

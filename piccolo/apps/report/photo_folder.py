@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from ...judge.result import Result
-from ...localization.result_photo import photo_of
+from ...api.values import Result, photo_of
 from ...photo.panorama.facts import sha256_of
 from ...system.errors import InputError
 from .pictures import FRAME

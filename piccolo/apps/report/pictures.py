@@ -21,17 +21,15 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from ...api.values import AMBIGUOUS, Result, photo_of
 from ...evidence.occlusion import occlusion_mask
 from ...geometry.colors import unpack_rgb
 from ...geometry.points import PackedPoints
 from ...geometry.pose import Pose, yaw_rotation
-from ...judge.probability import AMBIGUOUS
-from ...judge.result import Result
-from ...localization.result_photo import photo_of
 from ...photo.camera.model import pinhole
 from ...photo.panorama import Panorama, read_panorama
 from ...photo.panorama.model import shrink
-from ...photo.panorama.picture import read_picture
+from ...photo.panorama.picture import encode_image, read_picture
 from ...photo.panorama.video import frames_at
 from ...scan_map.scan_map import ScanMap
 from ...system.arrays import Array, Array32, Bytes, Int64s, Mask
@@ -39,7 +37,7 @@ from ...system.errors import InputError
 from ...system.files.atomic import temporary_folder
 from ...system.files.json_file import read_text
 from ...system.jobs.threads import Workers
-from ...views.pictures import cut, encode_image, fill_holes
+from ...views.pictures import cut, fill_holes
 from ...views.surfels import Surfels, render_surfels, visible_indices
 from ...views.zbuffer import View
 

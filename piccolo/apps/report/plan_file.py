@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from ...judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
+from ...api.values import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ...photo.panorama.picture import read_picture
 from ...scan_map.scan_map import ScanMap
 from ...system.arrays import Array

@@ -19,13 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...api.result_files import read_results
+from ...api.values import FAILED, NOT_LOCALIZED, SHOWN, UNREADABLE, PoseCovariance, Reason, Result
 from ...geometry.pose import Pose, heading_pitch_roll_deg
 from ...geometry.pose_gaussian import turn_positions
-from ...judge.pose_covariance import PoseCovariance
-from ...judge.probability import NOT_LOCALIZED
-from ...judge.reasons import Reason
-from ...judge.result import FAILED, UNREADABLE, Result
-from ...judge.sure import SHOWN
 from ...scan_map.scan_map import ScanMap
 from ...system.arrays import Array
 from ...system.errors import printable

@@ -21,10 +21,9 @@ from starlette.responses import JSONResponse, RedirectResponse, Response, Stream
 from starlette.routing import Route
 
 from ... import __version__
+from ...api.values import FAILED, UNREADABLE, CoarseToFineSettings, Result
 from ...batch.localizer import Task
-from ...judge.result import FAILED, UNREADABLE, Result
 from ...photo.photo import Photo
-from ...problem.settings import CoarseToFineSettings
 from ...scan_map.scan_map import ScanMap
 from ...system.errors import InputError
 from ...system.jobs.processes import OpeningError, Processes, TooSlowError, WorkerLostError

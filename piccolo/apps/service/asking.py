@@ -10,10 +10,9 @@ from typing import Any
 
 from starlette.datastructures import FormData, UploadFile
 
+from ...api.values import Accuracy, CoarseToFineSettings
 from ...photo.camera.calibration import calibration_of
 from ...photo.photo import Photo, Prior
-from ...problem.accuracy import Accuracy
-from ...problem.settings import CoarseToFineSettings
 from ...system.errors import UNPRINTABLE, InputError, printable
 from ...system.files.json_file import DAMAGE
 

@@ -9,9 +9,9 @@ from importlib.resources import files
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from ... import __version__
+from ...api.values import Accuracy
 from ...photo.camera import Calibration
 from ...photo.photo import Photo, Prior
-from ...problem.accuracy import Accuracy
 from .asking import ACCURACY, PHOTO, PRIOR
 
 NAMES = {float: "number", int: "integer", bool: "boolean", str: "string"}

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...api.scan import Scan
+from ...api.values import Result
 from ...batch.localizer import Localizer, Task
-from ...judge.result import Result
 from ...photo.panorama.picture import open_picture
 from ...scan_map.open_map import write_map
 from ...scan_map.scan_map import ScanMap
@@ -22,9 +22,8 @@ from ...system.errors import InputError
 from ...system.files.atomic import temporary_folder
 from ...system.jobs.processes import Function, Processes
 from ...system.jobs.threads import Workers
-from ...views.surfels import MAX_SURFELS, make_surfels
 from ..report import site
-from ..report.build import WIDTH, document_of_scan, list_poses
+from ..report.build import WIDTH, document_of_scan, draw_surfels, list_poses
 from ..report.pictures import make_pictures
 
 PIXELS = 1e6  # in a megapixel
@@ -144,8 +143,7 @@ def open_answering(localizer: Localizer, max_pixels: float) -> Function:
 
     @cache
     def surfels() -> Any:
-        points = scan.prepared.points.subsample(MAX_SURFELS)
-        return make_surfels(points, scan.workers), points
+        return draw_surfels(scan.prepared.points, scan.workers)
 
     def work(item: Sent | Drawing | None) -> list[Result] | str | None:
         if isinstance(item, Drawing):

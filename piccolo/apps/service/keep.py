@@ -10,7 +10,7 @@ from threading import Lock
 from typing import Any
 
 from ...api.result_files import read_results
-from ...judge.result import Result
+from ...api.values import Result
 from ...scan_map.scan_map import ScanMap
 from ...system.files.atomic import write_atomically
 from ...system.files.line_file import LineFile, open_locked, whole_size

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, features
 from PIL.ExifTags import IFD, Base
 from PIL.Image import Transpose
@@ -262,3 +263,18 @@ def _warnings(image: ImageFile) -> tuple[str, ...]:
         return (radiance.EXPOSED,)
     is_several = image.format == "TIFF" and getattr(image, "is_animated", False)
     return ("found more than one picture in the TIFF, the first was read",) if is_several else ()
+
+
+def encode_image(image: Bytes | NDArray[np.uint16], suffix: str, quality: int = 95) -> bytes:
+    """Return the file, as bytes, of an image (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) gray.
+
+    The suffix, such as ".png", gives the format; `quality`, up to 100, is that of a JPEG. Raises OSError if
+    the image can't be encoded.
+    """
+    order = cv2.COLOR_RGBA2BGRA if image.ndim == 3 and image.shape[2] == 4 else cv2.COLOR_RGB2BGR
+    bgr = cv2.cvtColor(image, order) if image.ndim == 3 else image
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if suffix in (".jpg", ".jpeg") else []
+    is_encoded, content = cv2.imencode(suffix, bgr, options)
+    if not is_encoded:
+        raise OSError(f"an image of {image.shape[1]} x {image.shape[0]} could not be encoded as {suffix}")
+    return content.tobytes()

@@ -19,12 +19,12 @@ from ...geometry.gauss_newton import Equations, minimize
 from ...geometry.pose import Pose, step, step_between
 from ...geometry.robust import geman_mcclure, inline_geman_mcclure
 from ...geometry.sphere import direction_to_pixel, pixel_jacobian, pixel_rays
-from ...local_features.view_image import render_gray
 from ...photo.panorama import Panorama, texels
 from ...photo.panorama.model import resize
 from ...system.arrays import Array, Array32, Int32s, Int64s
 from ...system.jobs.threads import Workers
 from ...system.kernels.jit import F0, Scalar, kernel, whole
+from ...views.view_image import render_gray
 
 ALIGNMENT_WIDTHS = 512, 1024, 2048  # [px] of the photos, from one round to the next
 POINTS_PER_PHOTO = 5000

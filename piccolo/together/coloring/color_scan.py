@@ -18,7 +18,7 @@ from ...cloud.writers import SUFFIXES, describe_unit, write_colored
 from ...geometry.pose import Pose
 from ...geometry.pose_gaussian import turn_positions
 from ...judge.result import FAILED, Result
-from ...localization.result_photo import read_as_localized
+from ...judge.result_photo import read_as_localized
 from ...photo.panorama import Panorama, texels
 from ...photo.panorama.model import shrink
 from ...scan_map.open_map import find_prepared_map

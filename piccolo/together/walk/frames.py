@@ -8,7 +8,6 @@ each: wherever the key frame is, their motion from it is the same.
 import math
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
-from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -159,12 +158,3 @@ class Motion:
     def jump_log(self) -> float:
         """Log odds of a jump, from a frame to a later one; frames without times may be anywhere."""
         return JUMP_LOG if self.is_timed else 0.0
-
-
-def check_times(times: Sequence[float]) -> None:
-    """Refuse times that are not finite or do not rise."""
-    if not all(math.isfinite(time) for time in times):
-        raise InputError("times: found one that is no finite number, wanted seconds")
-    for k, (before, after) in enumerate(pairwise(times)):
-        if after <= before:
-            raise InputError(f"times: found {after} after {before} at frame {k + 1}, wanted them to rise")

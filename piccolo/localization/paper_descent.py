@@ -10,10 +10,10 @@ import numpy as np
 from ..geometry.levenberg_marquardt import GRADIENT, LOSS, MATRIX, levenberg_marquardt
 from ..geometry.points import PackedPoints
 from ..geometry.pose import Pose, exp_so3, left_jacobian, orthonormal, step
+from ..optimize.sampling_loss import sampling_equations, sampling_loss
 from ..photo.panorama.texels import Texels
 from ..system.arrays import Array
 from ..views.zbuffer import visible_points
-from .sampling_loss import sampling_equations, sampling_loss
 
 LEAST_STEP = 1e-7  # [rad + m] of Gauss-Newton: a shorter one ends the descent
 

@@ -13,7 +13,7 @@ from ..geometry.sphere import direction_to_pixel
 from ..geometry.vectors import rotate
 from ..system.arrays import Array, Array32, Bytes, Floats, Mask
 from ..system.kernels.jit import F0, F1, HALF, Scalar, inline_kernel, kernel
-from ..views.view import Scratch, thread_scratch
+from .view import Scratch, thread_scratch
 
 DRAWN_VOXEL_PER_RANGE = 1.0 / 80.0  # largest voxel, divided by its distance
 DRAWN_REACH = np.float32(0.7)  # half width of what is drawn for a voxel, divided by the voxel's width

@@ -250,3 +250,9 @@ def find_scale(bundle: Bundle, estimates: Sequence[Estimate], errors: RelativeEr
         return 0.0, math.inf
     free = adjust(bundle, estimates, errors._replace(log_scale=UNKNOWN_SCALE))
     return free.bundle.log_scale, math.sqrt(free.covariance[6, 6])
+
+
+def move_origin_near(cams_from_bundle: Sequence[Pose]) -> list[Pose]:
+    """Move the origin of the common frame to the photos' mean position, so that turns hardly move them."""
+    mean = np.mean([pose.center_world for pose in cams_from_bundle], axis=0)
+    return [Pose(pose.R_cam_from_world, pose.center_world - mean) for pose in cams_from_bundle]

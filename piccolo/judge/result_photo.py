@@ -4,10 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..judge.result import Result
 from ..photo.camera import Calibration
 from ..photo.panorama import Panorama, read_panorama
 from ..photo.photo import Photo
+from .result import Result
 
 
 def photo_of(result: Result, path: Path | None = None) -> Photo:

@@ -13,17 +13,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ...batch.model_poses import transform_of_shot
-from ...batch.relative_poses import read_relative_poses, read_xml
+from ...api.values import Result
 from ...geometry.pose import Pose, log_so3
 from ...geometry.pose_gaussian import PoseGaussian, subtract
-from ...judge.result import Result
-from ...photo.camera.foreign import is_reconstruction
-from ...system.arrays import Array
-from ...system.errors import InputError, import_optional
-from ...system.files.atomic import write_atomically, write_json, write_lines
-from ...system.files.json_file import naming, read_json
-from ...together.bundle_adjustment import (
+from ...poses.bundle_adjustment import (
     UNKNOWN_SCALE,
     Bundle,
     Estimate,
@@ -32,9 +25,15 @@ from ...together.bundle_adjustment import (
     choose_agreed,
     find_odd,
     match_median,
+    move_origin_near,
 )
-from ...together.bundle_search import move_origin_near
-from .colmap import read_model, write_model
+from ...poses.model_poses import read_reconstruction, transform_of_shot
+from ...poses.relative_poses import read_relative_poses, read_xml
+from ...system.arrays import Array
+from ...system.errors import InputError, import_optional
+from ...system.files.atomic import write_atomically, write_json, write_lines
+from ...system.files.json_file import naming
+from ..export.colmap import read_model, write_model
 
 LEAST_MODEL_PHOTOS = 3
 MOST_SCALE = 0.1  # chosen: deviation of the logarithm of a scale that is still told
@@ -177,9 +176,7 @@ def write_aligned(model: Path, alignment: Alignment, out: Path) -> None:
 
 def _write_opensfm(model: Path, alignment: Alignment, out: Path) -> None:
     """Write a reconstruction.json: poses of shots and rigs, points; what refers to the globe is left out."""
-    document = read_json(model, WANTED_OPENSFM)
-    if not is_reconstruction(document):
-        raise InputError(f"{model}: found no reconstruction of OpenSfM, {WANTED_OPENSFM}")
+    document = read_reconstruction(model, WANTED_OPENSFM)
     scale, R_scan_from_model, translation, *_ = alignment
     with naming(model, WANTED_OPENSFM):
         for part in document:

@@ -14,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..cloud.e57_poses import list_posed_images, write_image_poses
 from ..geometry.pose import OPENGL_FROM_CAM, OPTICAL_FROM_CAM, Pose, check_pose
 from ..system.arrays import Array
 from ..system.errors import InputError
 from ..system.files.atomic import write_lines
 from ..system.files.json_file import is_number, naming, read_text
+from .e57_poses import list_posed_images, write_image_poses
 from .relative_poses import COLUMNS, find_columns
 
 WANTED = (

@@ -9,8 +9,9 @@ import numpy as np
 from ..geometry.pose import OPENGL_FROM_CAM, OPTICAL_FROM_CAM, Pose, check_transform, exp_so3
 from ..photo.camera.foreign import is_reconstruction
 from ..system.arrays import Array
+from ..system.errors import InputError
 from ..system.files.json_file import naming, read_json
-from ..together.bundle_adjustment import RelativeScale
+from .bundle_adjustment import RelativeScale
 
 SUFFIXES = (".json", ".sfm")
 NO_RIG = 0xFFFFFFFF  # Meshroom's number of a view that is of no rig
@@ -97,3 +98,11 @@ FORMS = (
     Form(_has("views", "poses"), _of_meshroom, OPTICAL_FROM_CAM, True, "unknown"),
     Form(_has("frames"), _of_transforms, OPENGL_FROM_CAM, False, "metres"),
 )
+
+
+def read_reconstruction(path: Path, wanted: str) -> Any:
+    """Return the parts of OpenSfM's reconstruction.json; `wanted` says in an error what it should hold."""
+    document = read_json(path, wanted)
+    if not is_reconstruction(document):
+        raise InputError(f"{path}: found no reconstruction of OpenSfM, {wanted}")
+    return document

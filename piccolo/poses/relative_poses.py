@@ -16,7 +16,7 @@ from ..system.arrays import Array
 from ..system.errors import InputError
 from ..system.files.json_file import is_number, naming, read_text
 from ..system.files.photo_names import match_names
-from ..together.bundle_adjustment import RelativeScale
+from .bundle_adjustment import RelativeScale
 from .model_poses import SUFFIXES, NamedPose, read_json_poses
 
 WANTED = (

@@ -11,11 +11,11 @@ from xml.dom import minidom
 
 import numpy as np
 
+from ..cloud.readers.e57 import E57Image, list_images
+from ..cloud.readers.e57_file import HEADER, NAMESPACE, PAGE_CONTENT, PAGE_SIZE, read_section
 from ..geometry.pose import OPENGL_FROM_CAM, Pose, quaternion_wxyz, turn_axes
 from ..system.arrays import Bytes
 from ..system.files.atomic import replacing
-from .readers.e57 import E57Image, list_images
-from .readers.e57_file import HEADER, NAMESPACE, PAGE_CONTENT, PAGE_SIZE, read_section
 
 ROTATION = "".join(f'<{k} type="Float">%r</{k}>' for k in "wxyz")
 TRANSLATION = "".join(f'<{k} type="Float">%r</{k}>' for k in "xyz")

@@ -1,0 +1,1 @@
+"""Applications: programs that are built upon the library, each with its commands; the rest imports none."""

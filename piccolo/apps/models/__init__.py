@@ -1,0 +1,1 @@
+"""Models of structure from motion, moved onto the scan."""

@@ -1,0 +1,1 @@
+"""The mount of a camera on a scanner, vehicle or robot, by photos and a trajectory."""
