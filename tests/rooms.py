@@ -12,7 +12,7 @@ import numpy as np
 
 from piccolo.api.scan import Scan
 from piccolo.cloud.settings import CloudSettings
-from piccolo.cloud.stream import Cloud, stream_of_arrays
+from piccolo.cloud.stream import CloudPoints, stream_of_arrays
 from piccolo.cloud.voxels import VoxelTable, morton_order
 from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.geometry.points import pack_points
@@ -45,7 +45,7 @@ def room(seed, num_points=NUM_POINTS):
     origin_world = np.round((points.min(axis=0).astype(float) + points.max(axis=0)) / 2)
     points = (points - origin_world).astype(np.float32)
     order = morton_order(points, colors)
-    return world, Cloud(points[order], colors[order], origin_world)
+    return world, CloudPoints(points[order], colors[order], origin_world)
 
 
 def stream(cloud):

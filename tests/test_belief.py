@@ -11,7 +11,7 @@ from piccolo.judge.by_others import Shares, believe_beside, believe_together, sh
 from piccolo.judge.reasons import WORDS, Contradiction, Reason, explain
 from piccolo.judge.result import Result, nothing_found
 from piccolo.judge.result_parts import Alternative, Evidence
-from piccolo.localization.paper import believe as believe_by_paper
+from piccolo.localization.paper import believe_roughly as believe_by_paper
 
 BELIEF = make_belief([0.9, 0.06], within=0.8, doubt=0.05)
 BUNDLES = np.array([0.9, 0.07, 0.03])

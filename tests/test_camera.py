@@ -16,7 +16,7 @@ from piccolo.geometry.pose import OPTICAL_FROM_CAM, exp_so3
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.photo.camera import Camera, Mount
 from piccolo.photo.camera.model import CUT_SPHERE, MODELS, camera_of_fov, pinhole
-from piccolo.photo.camera.resampling import MAX_REMAP_SIDE, View, make_sphere, shrunk, sphere_width
+from piccolo.photo.camera.resampling import MAX_REMAP_SIDE, CameraView, make_sphere, shrunk, sphere_width
 from piccolo.photo.panorama import read_panorama
 from piccolo.system.errors import InputError
 from piccolo.system.jobs.threads import Workers
@@ -234,7 +234,7 @@ def test_nothing_aliases_where_the_picture_is_finer_than_the_sphere():
     stripes = np.zeros((2400, 3000, 4), np.uint8)
     stripes[:, ::2] = 255
     stripes[..., 3] = 255
-    rgb, is_valid = make_sphere([View(Mount(camera), stripes)], 512)
+    rgb, is_valid = make_sphere([CameraView(Mount(camera), stripes)], 512)
     assert is_valid.mean() > 0.15
     assert np.abs(rgb[is_valid].astype(int) - 127).max() <= 6
 
@@ -242,7 +242,7 @@ def test_nothing_aliases_where_the_picture_is_finer_than_the_sphere():
 def test_where_cameras_overlap_the_nearer_axis_counts():
     white = np.full((400, 400, 4), 255, np.uint8)
     black = white * np.uint8([0, 0, 0, 1])
-    views = [View(Mount(FISHEYE), white), View(Mount(FISHEYE, BACK), black)]
+    views = [CameraView(Mount(FISHEYE), white), CameraView(Mount(FISHEYE, BACK), black)]
     for order in (views, views[::-1]):
         rgb, is_valid = make_sphere(order, 512)
         assert is_valid.all()
@@ -291,7 +291,7 @@ def test_a_rig_says_how_far_apart_its_cameras_are(tmp_path):
 @pytest.mark.parametrize(("finer", "is_shrunk"), [(0.5, False), (1.2, False), (1.3, True), (3.0, True)])
 def test_a_picture_that_is_hardly_finer_than_the_sphere_is_not_blurred(finer, is_shrunk):
     camera = pinhole(400, 300, finer * 1024 / math.tau)
-    view = View(Mount(camera), np.zeros((300, 400, 4), np.uint8))
+    view = CameraView(Mount(camera), np.zeros((300, 400, 4), np.uint8))
     found = shrunk(view, 1024)
     assert (found is not view) == is_shrunk
     assert found.pixels.shape[1] == (round(400 / finer) if is_shrunk else 400)
@@ -300,12 +300,12 @@ def test_a_picture_that_is_hardly_finer_than_the_sphere_is_not_blurred(finer, is
 @pytest.mark.parametrize("change", [-0.1, 0.1])
 def test_a_picture_is_made_smaller_once_for_calibrations_that_differ_a_little(change):
     camera = pinhole(400, 300, 3.0 * 1024 / math.tau)
-    found = shrunk(View(Mount(camera), np.zeros((300, 400, 4), np.uint8)), 1024)
+    found = shrunk(CameraView(Mount(camera), np.zeros((300, 400, 4), np.uint8)), 1024)
     beside = found._replace(mount=Mount(camera.change(change)))
     assert shrunk(beside, 1024) is beside
 
 
 def test_a_picture_too_long_to_be_sampled_is_always_made_smaller():
     camera = pinhole(MAX_REMAP_SIDE + 100, 10, 100.0)
-    view = View(Mount(camera), np.zeros((10, MAX_REMAP_SIDE + 100, 4), np.uint8))
+    view = CameraView(Mount(camera), np.zeros((10, MAX_REMAP_SIDE + 100, 4), np.uint8))
     assert shrunk(view).pixels.shape[1] == MAX_REMAP_SIDE

@@ -10,7 +10,7 @@ from refusals import assert_refused, mutated, read_or_refused
 from piccolo.geometry.pose import OPTICAL_FROM_CAM, exp_so3, quaternion_wxyz
 from piccolo.photo.camera.calibration import Mount, document_of, read_calibration, read_mounts, read_rig
 from piccolo.photo.camera.model import MODELS, Camera
-from piccolo.photo.camera.resampling import View, make_sphere, sphere_width
+from piccolo.photo.camera.resampling import CameraView, make_sphere, sphere_width
 from piccolo.system.errors import InputError
 
 TURN = exp_so3(np.array([0.2, -0.4, 1.1]))
@@ -224,7 +224,7 @@ def test_any_camera_that_is_taken_can_be_resampled(data):
         camera = Camera(model, 64, 48, params)
     except InputError:
         return
-    views = [View(Mount(camera), np.full((48, 64, 4), 255, np.uint8))]
+    views = [CameraView(Mount(camera), np.full((48, 64, 4), 255, np.uint8))]
     width = sphere_width([Mount(camera)]) if params[0] < 99 else 512
     rgb, is_valid = make_sphere(views, width)
     assert rgb[is_valid].min(initial=255) == 255

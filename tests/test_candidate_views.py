@@ -14,7 +14,7 @@ from piccolo.problem.profile import VIEWS
 from piccolo.system.jobs.threads import Workers
 from piccolo.views import points_around
 from piccolo.views.candidate_views import SEARCH_VIEW, CandidateViews, render_views, render_wide
-from piccolo.views.points_around import visible_points
+from piccolo.views.points_around import sample_visible_points
 from piccolo.views.view import average_view
 
 TIER = "scene"
@@ -142,7 +142,9 @@ def test_views_and_points_count_from_their_place():
     pose = _pose(0.307, 0.191, 0.304)
     place = points_around.round_position(pose)
     expected = rooms.view(problem.scan_map.octree, place, FINE, FINE_CELLS)
-    points = visible_points(problem.scan_map.octree, place, FULL, FINE_CELLS.tobytes(), EVERYWHERE, 30_000)
+    points = sample_visible_points(
+        problem.scan_map.octree, place, FULL, FINE_CELLS.tobytes(), EVERYWHERE, 30_000
+    )
     for found, wanted in (
         (problem.view_at(pose, "fine"), expected),
         (problem.view_at(pose, "points"), points),

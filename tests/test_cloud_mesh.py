@@ -9,7 +9,7 @@ from scans import read_cloud
 from scipy.spatial.transform import Rotation
 
 from piccolo.cloud.readers import mesh as mesh_module, mesh_loading
-from piccolo.cloud.readers.mesh import compute_weights, look_up, open_mesh
+from piccolo.cloud.readers.mesh import compute_weights, look_up_texels, open_mesh
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.stream import open_cloud
@@ -70,8 +70,8 @@ def test_look_up_against_texels_named_by_their_place():
     for row in range(3):
         for column in range(5):
             uv = np.array([[(column + 0.5) / 5 + 7, 1 - (row + 0.5) / 3 - 4]])
-            np.testing.assert_array_equal(look_up(texels, uv)[0], texels[row, column])
-    assert look_up(texels, np.array([[-1e-18, 1e-18]])).shape == (1, 4)
+            np.testing.assert_array_equal(look_up_texels(texels, uv)[0], texels[row, column])
+    assert look_up_texels(texels, np.array([[-1e-18, 1e-18]])).shape == (1, 4)
 
 
 def test_several_materials_and_quads(tmp_path):

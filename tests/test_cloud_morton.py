@@ -7,7 +7,7 @@ from clouds import seeded_cloud
 from hypothesis import given, settings, strategies as st
 
 from piccolo.cloud.readers.reader import PointSource, RawCloud
-from piccolo.cloud.stream import Cloud, CloudStream
+from piccolo.cloud.stream import CloudPoints, CloudStream
 from piccolo.cloud.voxels import morton_codes, morton_order
 
 A = Path("a")
@@ -18,7 +18,7 @@ def clean(path, raw, scale):
     return CloudStream([PointSource(path, lambda: iter([raw]), units=(scale,) * 3)]).read()
 
 
-def same_bits(a: Cloud, b: Cloud):
+def same_bits(a: CloudPoints, b: CloudPoints):
     return (
         a.points.tobytes() == b.points.tobytes()
         and a.colors.tobytes() == b.colors.tobytes()

@@ -117,7 +117,7 @@ def test_a_warning_is_written_once_whenever_it_comes(monkeypatch, capsys, quiet)
     monkeypatch.setattr(photo_run.Localizer, "open_scan", opened)
     run = photo_run.prepare_run(_parse(*["--quiet"] * quiet))
     with terminal.showing_log(quiet):
-        photo_run.open_scan(run, run.localizer, 1)
+        photo_run.open_scan_of_run(run, run.localizer, 1)
     assert capsys.readouterr().err == ("" if quiet else "warning: early\nwarning: set --up to -y\n")
 
 

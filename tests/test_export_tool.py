@@ -16,7 +16,7 @@ from refusals import mutated, read_or_refused
 from piccolo.api.result_files import read_results
 from piccolo.apps.export import export_poses
 from piccolo.apps.export.formats import FORMATS
-from piccolo.apps.export.posed_images import select
+from piccolo.apps.export.posed_images import select_results
 from piccolo.judge.result_parts import Source
 from piccolo.system.errors import InputError
 from research.datasets.generic import _table
@@ -69,7 +69,9 @@ def test_all_and_clouds_are_selected_in_order(run, tmp_path):
     assert "coordinate system" not in err
     code, _, err = run(*words, "--cloud", "c.ply")
     assert (code, "found no result for c.ply, wanted one of a.ply, b.ply" in err) == (3, True)
-    assert [r.pano for r in select(MIXED, use_all=True).results] == [MIXED[i].pano for i in (0, 1, 2, 4)]
+    assert [r.pano for r in select_results(MIXED, use_all=True).results] == [
+        MIXED[i].pano for i in (0, 1, 2, 4)
+    ]
 
 
 @pytest.mark.parametrize("name", FORMATS)

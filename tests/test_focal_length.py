@@ -14,7 +14,7 @@ import piccolo
 from piccolo.evidence import focal_length as focal
 from piccolo.evidence.examine import examine
 from piccolo.evidence.lens_matches import fit_matches
-from piccolo.evidence.self_calibration import Estimate
+from piccolo.evidence.self_calibration import LensEstimate
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import Selection
@@ -26,7 +26,7 @@ from piccolo.localization.calibration import follow_matches, recalibrate
 from piccolo.localization.localize import select_likeliest
 from piccolo.photo.camera import Calibration, Camera, Mount
 from piccolo.photo.camera.model import pinhole
-from piccolo.photo.camera.resampling import View, make_sphere
+from piccolo.photo.camera.resampling import CameraView, make_sphere
 from piccolo.photo.panorama import read_panorama
 from piccolo.photo.photo import Photo
 from piccolo.problem.method import METHOD
@@ -135,7 +135,7 @@ def test_each_source_of_a_focal_length_has_its_deviation():
 
 def _estimate(values, information):
     """What independent blocks without number tell of a lens."""
-    return Estimate(Told(values, information, np.zeros((0, 5, 5))), np.ones((6, 5)))
+    return LensEstimate(Told(values, information, np.zeros((0, 5, 5))), np.ones((6, 5)))
 
 
 @pytest.mark.parametrize(
@@ -243,7 +243,7 @@ def test_a_retaken_sphere_is_the_one_of_that_calibration_and_keeps_its_mask(tmp_
     panorama = read_panorama(Photo(path, focal_px=TRUE, mask_nadir_deg=80.0))
     found = panorama.resample(pinhole(320, 240, 1.1 * TRUE), 1024)
     pixels = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
-    wanted, is_wanted = make_sphere([View(Mount(pinhole(320, 240, 1.1 * TRUE)), pixels)], 1024)
+    wanted, is_wanted = make_sphere([CameraView(Mount(pinhole(320, 240, 1.1 * TRUE)), pixels)], 1024)
     assert not found.is_valid[300:].any()
     assert is_wanted[300:].any()
     assert (found.is_valid == is_wanted)[:270].mean() > 0.998

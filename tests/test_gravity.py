@@ -7,7 +7,7 @@ from rooms import room
 from scans import bare_room
 
 from piccolo.cloud import gravity as alignment
-from piccolo.cloud.gravity import Planes
+from piccolo.cloud.gravity import DominantPlanes
 from piccolo.cloud.octree import build_octree
 from piccolo.geometry.pose import exp_so3, rotation_to_z, yaw_rotation
 
@@ -86,13 +86,13 @@ def test_what_tells_nothing_is_not_known(points, reason):
 
 
 def test_levels_are_a_person_apart_and_tables_are_none():
-    class Planes:
+    class DominantPlanes:
         normals = np.array([Z, -Z, Z, Z, [1.0, 0.0, 0.0]])
         centers = np.array([[0, 0, 0.0], [0, 0, 2.5], [0, 0, 0.5], [0, 0, 5.0], [3, 0, 1.0]])
         areas = np.array([0.3, 0.25, 0.2, 0.05, 0.15])
 
-    np.testing.assert_array_equal(alignment.find_levels(Planes, Z), [0.0, 2.5])
-    np.testing.assert_array_equal(alignment.find_levels(Planes, -Z), [-2.5, 0.0])
+    np.testing.assert_array_equal(alignment.find_levels(DominantPlanes, Z), [0.0, 2.5])
+    np.testing.assert_array_equal(alignment.find_levels(DominantPlanes, -Z), [-2.5, 0.0])
 
 
 def test_tables_stand_on_floors_and_what_is_higher_says_nothing():
@@ -168,7 +168,9 @@ def test_every_plane_is_found_the_largest_first(hut):
 def planes_of(*normals, areas=None):
     normals = np.array(normals, float)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return Planes(normals, np.zeros_like(normals), np.array(areas or [1.0 / len(normals)] * len(normals)))
+    return DominantPlanes(
+        normals, np.zeros_like(normals), np.array(areas or [1.0 / len(normals)] * len(normals))
+    )
 
 
 @pytest.mark.parametrize("lean_deg", [0.5, 3.0, 14.0])

@@ -31,7 +31,7 @@ compile = Dispatcher.compile
 
 def note(self, signature, context):
     if len(within) == 1:
-        asked.append(f"{self.name} | {' '.join(map(ahead.describe, signature))}")
+        asked.append(f"{self.name} | {' '.join(map(ahead.describe_type, signature))}")
     return load(self, signature, context)
 
 def enter(self, signature):
@@ -51,7 +51,9 @@ sys.exit(code)
 
 def test_each_kernel_of_the_list_is_there_once_with_types_that_it_can_be_compiled_for():
     listed = [line for line in ahead.LISTED.read_text().splitlines() if not line.startswith("#")]
-    found = [f"{d._cache.name} | {' '.join(map(ahead.describe, types))}" for d, types in ahead.list_kernels()]
+    found = [
+        f"{d._cache.name} | {' '.join(map(ahead.describe_type, types))}" for d, types in ahead.list_kernels()
+    ]
     assert found == listed
     assert len(set(found)) == len(found) > 40
 
@@ -106,7 +108,7 @@ def test_helpers_compile_what_nobody_has_begun(folder):
 
     first = kernel(total)
     second = kernel(doubled)
-    arguments = ahead.parse("float64[1C]")
+    arguments = ahead.parse_types("float64[1C]")
     both = [(first, arguments), (second, arguments)]
     codegen = ahead.cpu_target.target_context.codegen()
     paths = [each._cache.file(arguments, codegen) for each in (first, second)]
@@ -120,7 +122,7 @@ def test_helpers_compile_what_nobody_has_begun(folder):
 def test_types_that_kernels_take_are_read_as_they_are_written():
     text = "float32[2C] float64[3A] int64 bool (float32[1C] float32[1C]) "
     text += "piccolo.photo.panorama.texels.Texels(int32[1C] int64 float64)"
-    assert " ".join(map(ahead.describe, ahead.parse(text))) == text
+    assert " ".join(map(ahead.describe_type, ahead.parse_types(text))) == text
 
 
 def test_help_ends_with_the_process_that_asked_for_it():

@@ -12,7 +12,7 @@ from made_up import exact_matches
 from piccolo.evidence.contradictions import contradictions
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.judge.reasons import explain
-from piccolo.local_features.hypotheses import count_matches, exact_pose, propose_poses, rough_poses
+from piccolo.local_features.hypotheses import count_inliers, exact_pose, propose_poses, rough_poses
 from piccolo.local_features.matching import match_located, merge_matches
 from piccolo.localization.attempts import search_features
 from piccolo.photo.photo import Prior
@@ -64,9 +64,9 @@ def test_the_pose_is_found_among_wrong_matches():
     assert found[0].num_matches >= 20
     assert rooms.errors(found[0].pose, POSE)[0] < 1e-4
     assert all(one.num_matches <= 6 for one in found[1:])
-    assert count_matches(matches, POSE) == found[0].num_matches
+    assert count_inliers(matches, POSE) == found[0].num_matches
     elsewhere = Pose(POSE.R_cam_from_world, POSE.center_world + np.array([2.0, 0.0, 0.0]))
-    assert count_matches(matches, elsewhere) < 4
+    assert count_inliers(matches, elsewhere) < 4
 
 
 def test_the_pose_of_too_few_matches_is_none():

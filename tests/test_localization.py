@@ -12,7 +12,7 @@ from golden_poses import check_golden_poses
 from rooms import as_panorama, errors, query, room, scan_map
 from threadpoolctl import threadpool_limits
 
-from piccolo.cloud.stream import Cloud, stream_of_arrays
+from piccolo.cloud.stream import CloudPoints, stream_of_arrays
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, uniform_yaws
 from piccolo.photo.photo import Prior
 from piccolo.problem.prior import allow_rotations, apply_prior, ball_of
@@ -97,7 +97,7 @@ def test_poses_in_a_cloud_that_a_rotation_turns_upright_are_in_the_files_frame()
     cloud = room(1)[1]
     taken = query(1)
     turn = exp_so3(np.array([np.pi / 2, 0.0, 0.0])) @ exp_so3(np.array([0.3, 0.3, 0.0]))
-    lying = Cloud((cloud.points @ turn.T).astype(np.float32), cloud.colors, cloud.origin_world)
+    lying = CloudPoints((cloud.points @ turn.T).astype(np.float32), cloud.colors, cloud.origin_world)
     lying_map = prepare_map(rooms.stream(lying), Workers(2), turn.T)
     assert lying_map.warnings == ()
     found = rooms.locate(as_panorama(taken.rgb), lying_map, rooms.KNOWN)

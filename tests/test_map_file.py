@@ -19,7 +19,7 @@ from piccolo.scan_map.map_file import first_misplaced, is_map_file, load_map, sa
 from piccolo.scan_map.open_map import content_key
 from piccolo.system.errors import InputError
 from piccolo.system.files import array_archive
-from piccolo.system.files.array_archive import ALIGNMENT, ArrayArchive, read_header, write_archive
+from piccolo.system.files.array_archive import ALIGNMENT, ArrayArchive, read_array_header, write_archive
 
 TIER = "scene"
 
@@ -283,8 +283,8 @@ def test_a_header_that_numpy_would_have_to_mend_is_refused_without_a_warning():
     file = io.BytesIO()
     np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (3, 6)})
     head = file.getvalue()
-    assert read_header(head) == ((3, 6), False, np.dtype("<f8"), len(head))
+    assert read_array_header(head) == ((3, 6), False, np.dtype("<f8"), len(head))
     with pytest.raises(ValueError, match="a header of Python 2"):
-        read_header(head.replace(b"(3, 6), }  ", b"(3L, 6L), }"))
+        read_array_header(head.replace(b"(3, 6), }  ", b"(3L, 6L), }"))
     with pytest.raises(ValueError, match=r"version 3.0, wanted 1.0 or 2.0"):
-        read_header(head.replace(b"NUMPY\x01", b"NUMPY\x03"))
+        read_array_header(head.replace(b"NUMPY\x01", b"NUMPY\x03"))

@@ -18,9 +18,9 @@ from piccolo.localization.paper import (
     color_histogram,
     free_grid,
     histogram_similarity,
-    localize,
+    localize_by_paper,
     paper_confidence,
-    prepare,
+    prepare_by_paper,
 )
 from piccolo.photo.panorama.model import shrink
 from piccolo.scan_map.camera_positions import MIN_CLEARANCE
@@ -36,7 +36,9 @@ def _localize(seed, variant, settings, num_threads=2):
     cloud = room(seed)[1]
     watch = Stopwatch()
     panorama = as_panorama(query(seed, variant).rgb)
-    return localize(prepare(cloud.pack(), settings), panorama, settings, Workers(num_threads), watch), watch
+    return localize_by_paper(
+        prepare_by_paper(cloud.pack(), settings), panorama, settings, Workers(num_threads), watch
+    ), watch
 
 
 @pytest.mark.parametrize(("seed", "variant"), [(1, "clean"), (4, "clean"), (1, "photo"), (4, "change")])
@@ -69,14 +71,18 @@ def test_same_bits_for_any_number_of_threads():
 def test_panorama_from_elsewhere_is_not_localized(name):
     noise = np.random.default_rng(0).integers(0, 256, (256, 512, 3), dtype=np.uint8)
     rgb = {"room 1": query(1).rgb, "black": np.zeros_like(noise), "noise": noise}[name]
-    found = localize(prepare(room(2)[1].pack(), QUICK), as_panorama(rgb), QUICK, Workers(2), Stopwatch())
+    found = localize_by_paper(
+        prepare_by_paper(room(2)[1].pack(), QUICK), as_panorama(rgb), QUICK, Workers(2), Stopwatch()
+    )
     assert found.status == "not_localized"
 
 
 def test_panorama_of_which_nothing_counts_has_no_pose():
     panorama = as_panorama(query(1).rgb)
     masked = dataclasses.replace(panorama, is_valid=np.zeros_like(panorama.is_valid))
-    found = localize(prepare(room(1)[1].pack(), QUICK), masked, QUICK, Workers(1), Stopwatch())
+    found = localize_by_paper(
+        prepare_by_paper(room(1)[1].pack(), QUICK), masked, QUICK, Workers(1), Stopwatch()
+    )
     assert found.status == "not_localized"
     assert found.pose is None
 
@@ -86,7 +92,7 @@ def test_golden_poses():
     settled = dataclasses.replace(QUICK, num_iterations=300)
 
     def arrays(seed):
-        return [prepare(room(seed)[1].pack(), QUICK).positions]
+        return [prepare_by_paper(room(seed)[1].pack(), QUICK).positions]
 
     check_golden_poses("paper.json", arrays, lambda *taken: _localize(*taken, settled)[0])
 

@@ -12,8 +12,8 @@ from rooms import as_panorama, errors, query, room
 from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import Pose, exp_so3, step
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.localization.paper import localize, prepare
-from piccolo.localization.paper_descent import refine
+from piccolo.localization.paper import localize_by_paper, prepare_by_paper
+from piccolo.localization.paper_descent import refine_by_solver
 from piccolo.photo.panorama.model import shrink
 from piccolo.system.errors import InputError
 from piccolo.system.jobs.threads import Stopwatch, Workers
@@ -131,7 +131,7 @@ def test_descent_recovers_the_true_pose(solver):
     points, panorama, true_pose = rooms.scene(1)
     settings = PhotometricSettings(photometric_width=128, solver=solver)
     start = step(true_pose, np.array([0.06, -0.04, 0.08, 0.1, -0.12, 0.05]))
-    refined = refine(points, settings.make_loss(panorama), start, settings)
+    refined = refine_by_solver(points, settings.make_loss(panorama), start, settings)
     rooms.assert_near(refined.pose, true_pose, 0.03, 0.5)
     assert refined.loss < photometric_loss(points, shrink(panorama, settings.photometric_width), start)
 
@@ -140,9 +140,9 @@ def test_descent_recovers_the_true_pose(solver):
 def test_camera_is_found_with_the_same_bits_for_any_number_of_threads(initialization):
     quick = {"num_translations": 20, "max_points": 30_000, "num_iterations": 40, "num_by_histogram": 3}
     settings = PhotometricSettings(photometric_width=128, initialization=initialization, **quick)
-    paper_map = prepare(room(1)[1].pack(), settings)
+    paper_map = prepare_by_paper(room(1)[1].pack(), settings)
     panorama = as_panorama(query(1).rgb)
-    one, two = (localize(paper_map, panorama, settings, Workers(n), Stopwatch()) for n in (1, 2))
+    one, two = (localize_by_paper(paper_map, panorama, settings, Workers(n), Stopwatch()) for n in (1, 2))
     assert errors(one.pose, query(1).pose)[0] < 0.1
     np.testing.assert_array_equal(one.pose.center_world, two.pose.center_world)
     assert (one.loss, one.evidence) == (two.loss, two.evidence)

@@ -8,7 +8,7 @@ import rooms
 
 from piccolo.geometry.pose import Pose, step, yaw_rotation
 from piccolo.localization.paper import PaperSettings
-from piccolo.localization.paper_descent import Adam, descend_lbfgs, make_sampling_loss, refine
+from piccolo.localization.paper_descent import Adam, descend_lbfgs, make_sampling_loss, refine_by_solver
 from piccolo.photo.panorama.texels import pack_texels
 
 PERTURBATION = np.array([0.05, -0.04, 0.12, 0.15, -0.12, 0.08])  # rad, m
@@ -25,7 +25,7 @@ def test_descent_recovers_the_true_pose(scene, solver, use_visibility):
     points, panorama, true_pose = scene
     texels = pack_texels(panorama.rgb)
     settings = dataclasses.replace(PaperSettings(), solver=solver, use_visibility=use_visibility)
-    refined = refine(points, make_sampling_loss(texels), step(true_pose, PERTURBATION), settings)
+    refined = refine_by_solver(points, make_sampling_loss(texels), step(true_pose, PERTURBATION), settings)
     rooms.assert_near(refined.pose, true_pose, 0.010, 0.3)
 
 

@@ -15,7 +15,7 @@ from piccolo.geometry.pose import (
     OPTICAL_FROM_CAM,
     rotation_from_quaternion_wxyz,
 )
-from piccolo.poses.relative_poses import find_scale, read_odometry, read_relative_poses, read_tum_row
+from piccolo.poses.relative_poses import find_file_scale, read_odometry, read_relative_poses, read_tum_row
 
 POSES = tilted_poses(4, np.array([20.0, -30.0, 2.0]))
 PHOTOS = [Path(f"photos/{k}.jpg") for k in (7, 8, 12, 100)]
@@ -86,7 +86,7 @@ def _meshroom(**more):
 def test_models_of_other_programs(tmp_path, name, document):
     path = _write(tmp_path / name, json.dumps(document))
     assert_same_poses(read_relative_poses(path, PHOTOS), POSES)
-    assert find_scale(path) == "unknown"
+    assert find_file_scale(path) == "unknown"
 
 
 def test_models_that_are_not_read_are_named(tmp_path):
@@ -253,7 +253,7 @@ def test_tables_of_trackers(tmp_path, header):
         rows.append(HEADERS[header].format(n=name.stem, **values))
     path = _write(tmp_path / "a.txt", "\n".join(rows) + "\n")
     _assert_expected(read_relative_poses(path, PHOTO_NAMES))
-    assert find_scale(path) == "metres"
+    assert find_file_scale(path) == "metres"
 
 
 def _colmap_values(k):
@@ -267,7 +267,7 @@ def test_poses_of_hloc_are_no_trajectory(tmp_path):
     rows = [[name, *q, *t] for name, (q, t) in zip(PHOTO_NAMES, map(_colmap_values, (1, 2)), strict=True)]
     path = _write(tmp_path / "a.txt", "\n".join(" ".join(map(str, row)) for row in rows))
     _assert_expected(read_relative_poses(path, PHOTO_NAMES))
-    assert find_scale(path) == "unknown"
+    assert find_file_scale(path) == "unknown"
 
 
 @pytest.mark.parametrize("between", ["\n", "\n\n", "\n10.5 20.5 -1 30 40 7\n"])
@@ -287,7 +287,7 @@ def test_colmaps_binary_images(tmp_path):
     path = tmp_path / "images.bin"
     path.write_bytes(content)
     _assert_expected(read_relative_poses(path, PHOTO_NAMES))
-    assert find_scale(path) == "unknown"
+    assert find_file_scale(path) == "unknown"
     path.write_bytes(content[:-30])
     assert_refused("found a file that is cut off, wanted COLMAP's", read_relative_poses, path, PHOTO_NAMES)
 

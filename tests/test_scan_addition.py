@@ -12,7 +12,7 @@ from refusals import assert_input_error
 from scipy.spatial import cKDTree
 
 from piccolo.cli import localize as localize_command, prepare_map as prepare_command
-from piccolo.cloud.stream import Cloud
+from piccolo.cloud.stream import CloudPoints
 from piccolo.cloud.voxels import LEAF_SIZE, VoxelTable, join_voxels
 from piccolo.geometry.pose import Pose
 from piccolo.localization.localize import localize
@@ -35,7 +35,7 @@ WORKERS = Workers(2)
 
 def _shifted(cloud, shift):
     """A cloud moved as a whole; the shift may be a fraction of a metre."""
-    return Cloud(cloud.points, cloud.colors, cloud.origin_world + shift)
+    return CloudPoints(cloud.points, cloud.colors, cloud.origin_world + shift)
 
 
 def _added(old, cloud, name):
@@ -75,7 +75,7 @@ def test_poses_are_those_of_a_map_of_both():
     a = rooms.room(1)[1]
     b = _shifted(rooms.room(2)[1], BESIDE)
     points = np.concatenate([a.points + a.origin_world, b.points + b.origin_world])
-    both = Cloud(points, np.concatenate([a.colors, b.colors]), np.zeros(3))
+    both = CloudPoints(points, np.concatenate([a.colors, b.colors]), np.zeros(3))
     whole = prepare_map(rooms.stream(both), WORKERS)
     scan_map = of_two_rooms()
     assert abs(len(scan_map.centers) / len(whole.centers) - 1.0) < 0.05
@@ -119,7 +119,7 @@ def test_views_are_made_anew_where_the_new_scan_is_seen():
     place = old.centers[np.linalg.norm(old.centers - taken, axis=1).argmin()]
     center_world = old.to_world(Pose(np.eye(3), place)).center_world
     colors = rng.integers(256, size=(len(points), 3), dtype=np.uint8)
-    column = Cloud(points.astype(np.float32), colors, center_world)
+    column = CloudPoints(points.astype(np.float32), colors, center_world)
     scan_map = _added(old, column, "column")
     gone = _rows(scan_map, old.centers)[1]
     beside = np.abs(old.centers - place) - size / 2

@@ -12,7 +12,7 @@ from rooms import as_panorama
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from piccolo.evidence.self_calibration import Estimate, FreeEnd, displace_blocks
+from piccolo.evidence.self_calibration import FreeEnd, LensEstimate, displace_blocks
 from piccolo.evidence.sphere import CLAIM, SphereFit, count_deviations
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.pose_gaussian import probability_of_ball
@@ -289,7 +289,7 @@ def test_a_panorama_as_it_is_has_no_geometry_to_tell_of():
 def test_a_claim_that_holds_widens_a_pose_by_what_picture_and_claim_leave_open():
     motion = np.zeros((6, 3))
     motion[5, 2] = 4.0  # metres up by a radian of the horizon
-    sharp = Estimate(_tell(np.zeros(3), np.diag([1e8, 1e8, 1e8])), motion)
+    sharp = LensEstimate(_tell(np.zeros(3), np.diag([1e8, 1e8, 1e8])), motion)
     camera = whole_sphere(512, 256)
     held = SphereFit(camera, sharp, is_claimed=True)
     assert math.sqrt(held.pose_covariance[5, 5]) == pytest.approx(4e-4, rel=0.01)

@@ -12,10 +12,10 @@ import rooms
 from made_up import exact_matches, make_candidate, make_selection
 from rooms import WORKERS
 
-from piccolo.cloud.stream import Cloud
+from piccolo.cloud.stream import CloudPoints
 from piccolo.cloud.voxels import morton_order
 from piccolo.evidence import verification
-from piccolo.evidence.covariance import estimate_covariance, estimate_errors
+from piccolo.evidence.covariance import estimate_covariance, estimate_pose_errors
 from piccolo.evidence.examine import complete, count_agreeing, examine
 from piccolo.evidence.measuring import measure
 from piccolo.geometry.nearness import ROOM_RANGE
@@ -24,7 +24,7 @@ from piccolo.geometry.pose_gaussian import LIKELY, subtract
 from piccolo.geometry.sphere import compute_indices
 from piccolo.judge.candidate import Drawn
 from piccolo.local_features import matching
-from piccolo.local_features.hypotheses import count_matches
+from piccolo.local_features.hypotheses import count_inliers
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization.copies import list_copies
 from piccolo.localization.judging import Found, judge
@@ -68,10 +68,10 @@ def _moved(offset, yaw=0.0):
 
 def test_a_photo_is_matched_with_one_beside_it_on_the_scan():
     matches = verification.match_beside(narrow_photo.problem(), narrow_photo.beside(), WORKERS)
-    agreeing = count_matches(matches, narrow_photo.true_pose(), METHOD.cos_agree)
+    agreeing = count_inliers(matches, narrow_photo.true_pose(), METHOD.cos_agree)
     assert agreeing >= 20
     assert (np.diff(matches.query) >= 0).all()
-    assert count_matches(matches, _moved((0.5, -0.4, 0.0)), METHOD.cos_agree) < 0.3 * agreeing
+    assert count_inliers(matches, _moved((0.5, -0.4, 0.0)), METHOD.cos_agree) < 0.3 * agreeing
     cloud = np.asarray(rooms.room(1, narrow_photo.NUM_POINTS)[1].points)
     nearest = [np.linalg.norm(cloud - point, axis=1).min() for point in matches.points]
     assert np.median(nearest) < 0.05
@@ -82,7 +82,7 @@ def test_what_moves_with_the_camera_is_no_match():
     own = verification.place_keypoints(narrow_photo.problem(), narrow_photo.true_pose(), WORKERS)
     matches = verification.match_beside(narrow_photo.problem(), own, WORKERS)
     assert len(matches.query) < 0.2 * len(narrow_photo.problem().photo.seen(WORKERS).keypoints.rays)
-    assert count_matches(matches, narrow_photo.true_pose(), METHOD.cos_agree) == 0
+    assert count_inliers(matches, narrow_photo.true_pose(), METHOD.cos_agree) == 0
 
 
 def test_a_mirrored_photo_has_no_matches_beside():
@@ -114,9 +114,9 @@ def _beside_its_twin():
     world, cloud = rooms.room(1, narrow_photo.NUM_POINTS)
     points, colors, _ = scan_world(world._replace(seed=99), narrow_photo.NUM_POINTS, Workers(2))
     twin = (points - cloud.origin_world).astype(np.float32) + APART
-    both = Cloud(np.vstack([cloud.points, twin]), np.vstack([cloud.colors, colors]), cloud.origin_world)
+    both = CloudPoints(np.vstack([cloud.points, twin]), np.vstack([cloud.colors, colors]), cloud.origin_world)
     order = morton_order(both.points, both.colors)
-    both = Cloud(both.points[order], both.colors[order], both.origin_world)
+    both = CloudPoints(both.points[order], both.colors[order], both.origin_world)
     return rooms.ask(narrow_photo.take()[0], prepare_map(rooms.stream(both), Workers(2)), rooms.UNKNOWN)
 
 
@@ -235,7 +235,7 @@ def test_a_pose_is_averaged_with_that_by_its_matches_unless_that_contradicts_the
     pose = step(narrow_photo.true_pose(), 0.5 * SMALL)
     candidate = examine(narrow_photo.problem(), pose)
     alone = estimate_covariance(narrow_photo.problem(), candidate, WORKERS)
-    found = estimate_errors(narrow_photo.problem(), candidate, WORKERS)
+    found = estimate_pose_errors(narrow_photo.problem(), candidate, WORKERS)
     assert (
         rooms.errors(found.gaussian.pose, narrow_photo.true_pose())[0]
         < rooms.errors(pose, narrow_photo.true_pose())[0]
@@ -246,7 +246,7 @@ def test_a_pose_is_averaged_with_that_by_its_matches_unless_that_contradicts_the
     before = Pose(np.eye(3), pose.center_world - moved / length)  # a metre behind
     near = tuple(narrow_photo.problem().scan_map.to_world(before).center_world)
     prior = Prior(near=near, radius=1.0 + 0.5 * length - MAX_DISTANCE)
-    told = estimate_errors(replace(narrow_photo.problem(), prior=prior), candidate, WORKERS)
+    told = estimate_pose_errors(replace(narrow_photo.problem(), prior=prior), candidate, WORKERS)
     assert told.gaussian.pose.key == pose.key
 
 
@@ -255,7 +255,9 @@ def test_the_loss_is_that_of_the_averaged_pose():
     pose = step(narrow_photo.true_pose(), 0.5 * SMALL)
     candidate = examine(problem, pose)
     measured = measure(problem, make_selection(candidate), None, WORKERS)
-    assert measured.pose.key == estimate_errors(problem, candidate, WORKERS).gaussian.pose.key != pose.key
+    assert (
+        measured.pose.key == estimate_pose_errors(problem, candidate, WORKERS).gaussian.pose.key != pose.key
+    )
     points = visible_points(problem.surroundings_at(pose)[0], measured.pose.center_world)
     assert measured.loss == sampling_loss(points, problem.colors(), measured.pose)
     assert measured.loss < sampling_loss(points, problem.colors(), pose)
@@ -369,6 +371,6 @@ def test_matches_with_a_pose_count_though_the_best_pose_is_farther_away(by_chanc
     away = Pose(pose.R_cam_from_world, pose.center_world + np.array([0.4, 0.0, 0.0]))
     monkeypatch.setattr("piccolo.evidence.examine.verify", lambda *_: verification.Verified(away, 50))
     profile = replace(narrow_photo.problem().profile, method=replace(METHOD, chance_matches=by_chance))
-    at_pose = count_matches(_draw(pose), pose, METHOD.cos_agree)
+    at_pose = count_inliers(_draw(pose), pose, METHOD.cos_agree)
     assert METHOD.sure_matches < at_pose != 50
     assert _count(replace(narrow_photo.problem(), profile=profile), pose) == (at_pose if is_counted else 0)

@@ -12,7 +12,7 @@ from piccolo.scan_map import camera_positions
 from piccolo.system.jobs.threads import Workers
 from piccolo.views import view
 from piccolo.views.candidate_views import SEARCH_VIEW
-from piccolo.views.points_around import points_around, take_children, visible_points
+from piccolo.views.points_around import points_around, sample_visible_points, take_children
 from piccolo.views.view import ViewConfig
 
 LEAVES = ViewConfig(
@@ -58,13 +58,13 @@ def test_cells_that_are_not_shown_change_nothing_elsewhere(octree):
     channels = naive.normalized_cells(twin[1], (twin[2] > 0) & shown, 24, 16, 22.0)
     both = part.weights > 0
     assert np.abs(part.channels[:, both] - channels[both].T).mean() < 0.01
-    points = visible_points(octree, center, LEAVES, shown.tobytes(), EVERYWHERE, 3000)
+    points = sample_visible_points(octree, center, LEAVES, shown.tobytes(), EVERYWHERE, 3000)
     assert shown[_cells(points.offsets.T)].mean() > 0.99
 
 
 def test_points_that_are_seen_lie_at_the_front_and_are_bounded(octree):
     center = rooms.scene(1)[2].center_world
-    offsets, _, weights, _ = visible_points(octree, center, LEAVES, ALL.tobytes(), EVERYWHERE, 3000)
+    offsets, _, weights, _ = sample_visible_points(octree, center, LEAVES, ALL.tobytes(), EVERYWHERE, 3000)
     assert 1000 < len(weights) <= 3000
     ranges = np.linalg.norm(offsets, axis=0)
     nearest = np.full(len(make_grid(24)), np.inf)
@@ -112,9 +112,9 @@ def test_every_other_centre_is_seen_by_the_kernel_that_sees_all(octree):
     """A kernel of its own would be compiled while the time of a sample is taken."""
     centers = rooms.scene(1)[2].center_world + np.linspace(0.0, 0.3, 15).reshape(5, 3)
     ranges = view.ranges_around(octree, centers, SEARCH_VIEW)
-    compiled = list(view.nearest_ranges.signatures)
+    compiled = list(view.nearest_node_ranges.signatures)
     np.testing.assert_array_equal(view.ranges_around(octree, centers[::2], SEARCH_VIEW), ranges[::2])
-    assert view.nearest_ranges.signatures == compiled
+    assert view.nearest_node_ranges.signatures == compiled
 
 
 def test_points_around_are_all_near_ones_and_fewer_far_ones(octree):

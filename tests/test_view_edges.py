@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from piccolo.geometry.sphere import make_grid
-from piccolo.views.edges import draw_edges
+from piccolo.views.edges import replace_by_edges
 
 RINGS = 48
 DIRECTIONS = make_grid(RINGS).directions.astype(np.float64)
@@ -16,7 +16,7 @@ def _draw(ranges):
     """Strength and vertical part (N,) of the edges of grey surfaces at ranges (N,) [m]."""
     sums = np.column_stack([DIRECTIONS * ranges[:, None], np.full((len(ranges), 3), 0.5), ranges > 0, ranges])
     sums = sums.astype(np.float32)
-    draw_edges(sums, RINGS)
+    replace_by_edges(sums, RINGS)
     r, g, b = sums[:, 3:6].T
     strength = (2.0 * g - r - b) / 1.2 + 0.5
     return np.where(ranges > 0, [strength, ((r - b) / 0.3 + strength) / 2.0], 0.0)

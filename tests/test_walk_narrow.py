@@ -24,7 +24,7 @@ from piccolo.together.walk.expectation import (
     list_starts,
 )
 from piccolo.together.walk.following import (
-    Told,
+    KnownPoses,
     choose_held,
     compute_gain,
     find_near,
@@ -150,7 +150,7 @@ def test_a_narrow_photo_gains_where_a_sure_one_beside_confirms_its_pose(seen, co
     expected = tracked.expected(tracked.off(seen[1], 0.1, 3.0), 0.1)
     near, _ = narrow_down(taken, expected.last, expected.reach, rooms.AUTO.effort)
     for beside, gain in (((exact,), compute_gain(taken, near)), ((None,), 0.0)):
-        found = find_near(taken, expected, rooms.means(), Told(beside=beside)).state
+        found = find_near(taken, expected, rooms.means(), KnownPoses(beside=beside)).state
         assert found.gain == pytest.approx(gain, rel=0.01)
         assert pose_errors(found.pose, seen[1])[0] < (0.01 if gain else 0.05)
     unknown = find_near(replace(taken, beside=()), expected, rooms.means()).state

@@ -13,7 +13,7 @@ from piccolo.localization.beam import score_briefly, score_mirror
 from piccolo.localization.near import Near
 from piccolo.problem.method import METHOD
 from piccolo.together.walk.expectation import (
-    Expected,
+    ExpectedFrame,
     Start,
     describe_end,
     expect,
@@ -57,7 +57,7 @@ def test_a_camera_is_expected_by_its_motion_before_or_by_an_odometry(seen):
     _, true = seen
     before = tracked.off(true, -0.35, 0.0)
     frame = Frame(1.0)
-    assert expect(frame, [(Frame(0.5), true)], Motion()) == Expected(true, Motion().reach(0.5), true)
+    assert expect(frame, [(Frame(0.5), true)], Motion()) == ExpectedFrame(true, Motion().reach(0.5), true)
     walked = expect(frame, [(Frame(0.5), true), (Frame(0.0), before)], Motion())
     assert (walked.last, walked.reach) == (true, Motion().reach(0.5))
     assert pose_errors(walked.pose, tracked.off(true, 0.35, 0.0))[0] == pytest.approx(0.0, abs=1e-9)

@@ -7,7 +7,7 @@ import numpy as np
 import rooms
 
 from piccolo.geometry.pose import Pose, exp_so3
-from piccolo.together.walk.expectation import Expected
+from piccolo.together.walk.expectation import ExpectedFrame
 from piccolo.together.walk.frames import Motion
 
 SEED = 1
@@ -36,4 +36,4 @@ def narrow(problem):
 
 
 def expected(last, seconds, pose=None):
-    return Expected(last, Motion().reach(seconds), pose or last)
+    return ExpectedFrame(last, Motion().reach(seconds), pose or last)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..cloud.settings import METRES, CloudSettings, UpAxis
 from ..cloud.stream import ARRAYS, CloudStream, open_cloud, stream_of_arrays
-from ..localization.paper import PaperMap, prepare as prepare_by_paper
+from ..localization.paper import PaperMap, prepare_by_paper
 from ..photo.photo import File
 from ..problem.prior import ball_of
 from ..problem.settings import CoarseToFineSettings
@@ -31,7 +31,7 @@ from ..system.jobs.threads import (
 from .photo_reader import Settings
 from .scan import Scan
 
-__all__ = ["Cloud", "find_prepared_map", "open_files", "open_points", "open_scan", "scan_of"]
+__all__ = ["Cloud", "find_prepared_map", "open_files", "open_points", "open_scan", "prepare_scan"]
 Units = Literal["mm", "cm", "m", "ft", "us-ft"]
 DEFAULT = CoarseToFineSettings()
 
@@ -165,7 +165,7 @@ def open_scan(
         stream = stream_of_arrays(
             given.source, None if given.ignore_colors else given.colors, given.color_range
         )
-        return scan_of(stream, str(ARRAYS), given.settings, settings, workers, Stopwatch())
+        return prepare_scan(stream, str(ARRAYS), given.settings, settings, workers, Stopwatch())
     policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
     return open_files(given.paths, given.settings, settings, policy, workers)
 
@@ -189,10 +189,10 @@ def open_files(
     with watch.stage("read"):
         cloud = open_cloud(paths, cloud_settings, workers.show)
         cloud = replace(cloud, sha256=sha256_of_files(paths))
-    return scan_of(cloud, name, cloud_settings, settings, workers, watch)
+    return prepare_scan(cloud, name, cloud_settings, settings, workers, watch)
 
 
-def scan_of(
+def prepare_scan(
     cloud: CloudStream,
     name: str | tuple[str, ...],
     cloud_settings: CloudSettings,

@@ -18,8 +18,8 @@ from ..together.coloring.color_scan import (
     OF_RESULTS,
     PAINTED,
     Coloring,
-    check_files,
-    check_suffix,
+    check_colored_suffix,
+    check_point_files,
     color_if_enough,
     localize_for_colors,
     write_colored_scan,
@@ -29,7 +29,7 @@ from .scan_photo import Asked
 __all__ = [
     "LEAST_COLORING_PHOTOS",
     "PAINTED",
-    "check_suffix",
+    "check_colored_suffix",
     "color_by",
     "color_if_enough",
     "write_colored_scan",
@@ -50,8 +50,8 @@ def color_by(
     `localize` returns the result of a photo in the scan as it is shown to it.
     """
     files = [Path(path) for path in ([name] if isinstance(name, str) else name)]
-    check_files(files)
-    check_suffix(out)
+    check_point_files(files)
+    check_colored_suffix(out)
     check_output(out)
     if any(isinstance(one.photo.picture, np.ndarray) for one in asked):
         raise InputError("`photos`: found an array, wanted files, which are read again for their colours")

@@ -8,7 +8,7 @@ from ..judge.result import Result, nothing_found
 from ..judge.result_parts import FocalLength
 from ..localization.localize import has_guessed_focal, localize, localize_guessed
 from ..localization.means import NO_TRACE, Means, Trace
-from ..localization.paper import PaperMap, PaperSettings, localize as localize_by_paper
+from ..localization.paper import PaperMap, PaperSettings, localize_by_paper
 from ..localization.places import add_places
 from ..photo.photo import Photo
 from ..problem.settings import CoarseToFineSettings

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ..api.opening import scan_of
+from ..api.opening import prepare_scan
 from ..api.values import LOCALIZED, CoarseToFineSettings
 from ..cli.command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from ..cli.options import add_cloud_options
 from ..cli.settings import cloud_settings_from
-from ..cloud.gravity import MAX_LEAN, dot, find_up, level, wall_yaw
+from ..cloud.gravity import MAX_LEAN, dot_products, find_up, level, wall_yaw
 from ..cloud.octree import build_octree
 from ..cloud.settings import CloudSettings, R_z_from_axis
 from ..cloud.stream import CloudStream, open_cloud
@@ -47,7 +47,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--pano FILE", "localize this upright photo in the scan, and take its up direction")
 
 
-def check_arguments(a: Arguments) -> None:
+def check_up_options(a: Arguments) -> None:
     """Refuse options that do not go together."""
     if a.up != "auto":
         a.refuse_given(("assume_nothing", "pano"), "not with --up")
@@ -67,7 +67,7 @@ def find_known_up(
             return None, f"the floors do not face {cloud.up} ({reason})"
         return named, "up is the named axis"
     scanners = cloud.station_axes
-    if len(scanners) and dot(scanners, scanners[0]).min() > np.cos(MAX_LEAN):
+    if len(scanners) and dot_products(scanners, scanners[0]).min() > np.cos(MAX_LEAN):
         return scanners[0], "the scanners stood upright"
     return evident, reason
 
@@ -76,13 +76,15 @@ def find_up_by_photo(photo: Path, cloud: CloudStream, axis: Array) -> tuple[Arra
     """Return up (3,) by a photo, localized in the scan turned by its vertical; None if it isn't; and why."""
     workers = Workers(num_cores(), cloud.show)
     settings = CoarseToFineSettings(gravity="unknown")
-    scan = scan_of(cloud, cloud.label, CloudSettings(), settings, workers, Stopwatch(), rotation_to_z(axis))
+    scan = prepare_scan(
+        cloud, cloud.label, CloudSettings(), settings, workers, Stopwatch(), rotation_to_z(axis)
+    )
     result = scan.localize(photo)
     up = result.pose.R_cam_from_world[2] if result.pose and result.status == LOCALIZED else None
     return up, f"{photo} is {result.status}"
 
 
-def find(arguments: Arguments, cloud: CloudStream) -> tuple[Array, dict[str, object], str]:
+def find_transform(arguments: Arguments, cloud: CloudStream) -> tuple[Array, dict[str, object], str]:
     """Return the transform (4, 4) in the scan's unit; what is known of it; why it can't be relied on.
 
     It is the least turn that makes z up, and with --yaw-walls the least further one about z, about the middle
@@ -118,7 +120,7 @@ def find(arguments: Arguments, cloud: CloudStream) -> tuple[Array, dict[str, obj
 def main(arguments: Arguments) -> int:
     """Find a transform, write what is sure; returns the exit code."""
     with checking_options():
-        check_arguments(arguments)
+        check_up_options(arguments)
         settings = cloud_settings_from(arguments)
     out = arguments.out
     transform = out.with_suffix(".txt") if out and not is_stream(out) else None
@@ -127,7 +129,7 @@ def main(arguments: Arguments) -> int:
     if arguments.pano:
         read_panorama(arguments.pano)  # refused before the cloud is read
     cloud = open_cloud(arguments.cloud, settings, arguments.progress())
-    T, report, doubt = find(arguments, cloud)
+    T, report, doubt = find_transform(arguments, cloud)
 
     def write_transform() -> None:
         if transform:

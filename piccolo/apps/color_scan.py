@@ -4,7 +4,7 @@ from argparse import ArgumentParser
 
 from ..api.opening import open_files
 from ..api.result_files import read_results
-from ..api.scan_coloring import check_suffix, write_colored_scan
+from ..api.scan_coloring import check_colored_suffix, write_colored_scan
 from ..api.values import CoarseToFineSettings
 from ..cli.command import Arguments, check_outputs, checking_options, command, option
 from ..cli.options import CACHE_TEXT, add_cloud_options
@@ -36,7 +36,7 @@ def main(arguments: Arguments) -> int:
     """Read, align, paint, write; returns the exit code."""
     with checking_options():
         settings = cloud_settings_from(arguments)
-        check_suffix(arguments.out)
+        check_colored_suffix(arguments.out)
     check_outputs({"--out": arguments.out}, [*arguments.cloud, *arguments.results])
     results = read_results(arguments.results)
     method = CoarseToFineSettings()

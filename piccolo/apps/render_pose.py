@@ -54,7 +54,7 @@ SUFFIXES = {  # of outputs, those of stdout and devices first; "" is a folder
 }
 
 
-class Shot(NamedTuple):
+class PictureToDraw(NamedTuple):
     """A picture to draw."""
 
     pano: str  # the panorama's path
@@ -119,7 +119,7 @@ def suffix_of(option: str, path: Path) -> str:
     return SUFFIXES[option][0] if is_stream(path) else path.suffix.lower()
 
 
-def check_files(arguments: Arguments, poses: list[Shot]) -> None:
+def check_pictures(arguments: Arguments, poses: list[PictureToDraw]) -> None:
     """Refuse, before any work, what could not be written, or would replace an input."""
     given = (arguments.result, arguments.pose, arguments.camera)
     photos = [Path(shot.pano) for shot in poses]
@@ -128,7 +128,7 @@ def check_files(arguments: Arguments, poses: list[Shot]) -> None:
         (check_output_folder if is_folder(path) else check_output)(path)
 
 
-def poses_from(arguments: Arguments) -> list[Shot]:
+def poses_from(arguments: Arguments) -> list[PictureToDraw]:
     """Return poses asked for, named by the panorama's path, the pose's file or "at", with their cameras."""
     given = read_calibration(arguments.camera).mounts if arguments.camera else ()
     if len(given) > 1:
@@ -166,9 +166,13 @@ def read_pose_matrix(path: Path) -> Pose:
     return check_transform(T, str(path), CAMERA_AXES["piccolo"])
 
 
-def shot_of(pano: str, pose: Pose, mounts: tuple[Mount, ...]) -> Shot:
+def shot_of(pano: str, pose: Pose, mounts: tuple[Mount, ...]) -> PictureToDraw:
     """Return the picture of a pose by its one camera, if it has one; a rig's is the sphere."""
-    return Shot(pano, mounts[0].pose(pose), mounts[0].camera) if len(mounts) == 1 else Shot(pano, pose, None)
+    return (
+        PictureToDraw(pano, mounts[0].pose(pose), mounts[0].camera)
+        if len(mounts) == 1
+        else PictureToDraw(pano, pose, None)
+    )
 
 
 def depth_file(depth: Array32, suffix: str) -> bytes:
@@ -181,7 +185,9 @@ def depth_file(depth: Array32, suffix: str) -> bytes:
     return file.getvalue()
 
 
-def draw_pictures(arguments: Arguments, cloud: LocalCloud, poses: list[Shot], workers: Workers) -> None:
+def draw_pictures(
+    arguments: Arguments, cloud: LocalCloud, poses: list[PictureToDraw], workers: Workers
+) -> None:
     """Write the pictures; one JSON line each."""
     is_many = is_folder(arguments.out)
     names = [f"{Path(shot.pano).stem}.png" for shot in poses] if is_many else [arguments.out.name]
@@ -189,7 +195,7 @@ def draw_pictures(arguments: Arguments, cloud: LocalCloud, poses: list[Shot], wo
     if len(set(names)) < len(names):
         raise InputError(f"{arguments.out}: panoramas of the same name; choose one with --pano")
 
-    def write(folder: Path, name: str, shot: Shot) -> dict[str, object]:
+    def write(folder: Path, name: str, shot: PictureToDraw) -> dict[str, object]:
         camera = shot.camera and shot.camera.scale_to_width(arguments.width)
         width = sphere_width_for(camera) if camera else arguments.width
         view = render_points(cloud.points, cloud.from_world(shot.pose), width, workers)
@@ -217,7 +223,7 @@ def main(arguments: Arguments) -> int:
     with checking_options():
         check_usage(arguments)
     poses = poses_from(arguments)
-    check_files(arguments, poses)
+    check_pictures(arguments, poses)
 
     workers = arguments.workers()
     cloud = open_points(arguments.cloud, cloud_settings_from(arguments), workers)

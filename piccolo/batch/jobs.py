@@ -19,7 +19,7 @@ from ..api.scan_walk import Walk
 from ..api.values import FAILED, UNREADABLE, CoarseToFineSettings, Pose, Result, Step, Trace
 from ..photo.panorama.facts import sha256_of
 from ..photo.photo import Photo
-from ..poses.relative_poses import find_scale, read_relative_poses
+from ..poses.relative_poses import find_file_scale, read_relative_poses
 from ..scan_map.scan_map import ScanMap
 from ..system.errors import InputError
 from ..system.files.atomic import STDOUT, is_stream, write_lines
@@ -108,7 +108,7 @@ def make_bundle_job(
             for (photo, settings), pose, trace in zip(asked, poses, traces, strict=True)
             if pose is not None and isinstance(settings, CoarseToFineSettings)
         ]
-        found = iter(localize_posed(scan_map, scan.reader, scan.workers, posed, find_scale(relative)))
+        found = iter(localize_posed(scan_map, scan.reader, scan.workers, posed, find_file_scale(relative)))
         answer = localizer.answer_in(scan)
         results = []
         for path, pose, trace in zip(photos, poses, traces, strict=True):
@@ -154,7 +154,7 @@ def make_coloring_job(
 ) -> Job:
     """Return the job of localizing photos in the colours of the others, by which `out` is to be coloured."""
     scan_map, _ = scan.require_default_method("colours", scan.settings)
-    color_scan.check_files(localizer.paths)
+    color_scan.check_point_files(localizer.paths)
     given = {str(path): localizer.ask(path)[0] for path in photos}
 
     def localize(shown: ScanMap, k: int) -> Result:

@@ -157,7 +157,7 @@ def note_unused_priors(arguments: Arguments, localizer: Localizer) -> None:
         arguments.note(f"warning: {priors.path}: {note}")
 
 
-def open_scan(run: Run, localizer: Localizer, num_threads: int) -> Scan:
+def open_scan_of_run(run: Run, localizer: Localizer, num_threads: int) -> Scan:
     """Read and prepare the scan."""
     workers = run.arguments.workers(num_threads)
     scan = localizer.open_scan(workers)
@@ -193,7 +193,7 @@ def open_output(run: Run) -> Iterator[tuple[Output, Records]]:
 def record(run: Run, answer: Answer, write: Write) -> None:
     """Write the pictures asked for and the result, and say what was found."""
     result = answer.result
-    write_pictures(run.arguments, result.pano, answer.overlay, answer.occlusion_mask)
+    write_photo_pictures(run.arguments, result.pano, answer.overlay, answer.occlusion_mask)
     execution.print_result(run.arguments, result, answer.warnings)
     write_steps(run, result.pano, answer.steps)
     write(result.to_json())
@@ -202,7 +202,7 @@ def record(run: Run, answer: Answer, write: Write) -> None:
         run.doubtful.append(result.pano)
 
 
-def write_pictures(
+def write_photo_pictures(
     arguments: Arguments, pano: str, overlay: bytes | None, occlusion_mask: bytes | None
 ) -> None:
     """Write the pictures of a photo that are asked for, in folders by its name."""
@@ -339,19 +339,19 @@ def run_jointly(run: Run) -> int:
             frames, motion = stack.enter_context(taken)
             if run.left_out:
                 arguments.note(describe_left_out(run.left_out))
-            scan = open_scan(run, localizer, arguments.threads or num_cores())
+            scan = open_scan_of_run(run, localizer, arguments.threads or num_cores())
             asked = together.ask_for_walk(arguments, frames, scan, motion, steps_of)
         elif arguments.video:
             shown = stack.enter_context(together.distinct_frames(arguments))
-            scan = open_scan(run, localizer, arguments.threads or num_cores())
+            scan = open_scan_of_run(run, localizer, arguments.threads or num_cores())
             asked = together.ask_together(arguments, shown, localizer, scan, steps_of)
         else:
-            scan = open_scan(run, localizer, arguments.threads or num_cores())
+            scan = open_scan_of_run(run, localizer, arguments.threads or num_cores())
             asked = together.choose_job(arguments)(arguments, photos, localizer, scan, steps_of)
         stack.enter_context(tracing(run))
 
         def write(photo: Photo, result: Result) -> None:
-            write_pictures(arguments, result.pano, *localizer.make_pictures(scan, photo, result))
+            write_photo_pictures(arguments, result.pano, *localizer.make_pictures(scan, photo, result))
 
         return together.run_together(arguments, asked, write)
 
@@ -384,7 +384,7 @@ def localize_photos(arguments: Arguments) -> int:
             arguments.note(f"{arguments.out or 'nothing'}: nothing is left to do")
             return finish(run, records, output, Interruption(), 0.0)
         num_jobs = execution.count_jobs(arguments, num_left or num_looks or None)
-        opening = partial(open_scan, run)
+        opening = partial(open_scan_of_run, run)
         with (
             execution.connecting(arguments) as cluster,
             execution.executing(arguments, run.localizer, num_jobs, cluster, opening) as place,

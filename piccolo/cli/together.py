@@ -93,7 +93,7 @@ def check_joint_options(arguments: Arguments) -> None:
         option = "--walk" if a.walk else "--together" if a.together else "--color-scan"
         raise UsageError(f"{option}: found names on stdin, wanted files or folders")
     if a.color_scan:
-        scan_coloring.check_suffix(a.color_scan)
+        scan_coloring.check_colored_suffix(a.color_scan)
     Motion(max_speed=a.max_speed)  # refuses a wrong one
 
 

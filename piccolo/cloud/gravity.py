@@ -40,7 +40,7 @@ class PointNormals(NamedTuple):
     is_flat: Mask  # (M,) the neighbourhood is a plane
 
 
-class Planes(NamedTuple):
+class DominantPlanes(NamedTuple):
     """Dominant planes, the largest first."""
 
     normals: Array  # (P, 3) unit, of either sign
@@ -48,7 +48,7 @@ class Planes(NamedTuple):
     areas: Array  # (P,) fraction of all points of the sample, which are spread evenly in space
 
 
-def dot(vectors: Array, axis: Array) -> Array:
+def dot_products(vectors: Array, axis: Array) -> Array:
     """Return dot products (M,) of vectors (M, 3) and an axis (3,); by BLAS they would depend on threads."""
     return np.asarray(np.einsum("ni,i->n", vectors, axis))
 
@@ -67,7 +67,7 @@ def estimate_normals(points: Array32) -> PointNormals:
     return PointNormals(sample, axes[:, :, 0], is_flat)
 
 
-def ransac_planes(cloud: PointNormals) -> Planes:
+def ransac_planes(cloud: PointNormals) -> DominantPlanes:
     """Return the dominant planes: RANSAC on flat points, least squares on all inliers."""
     rng = np.random.default_rng(20)
     left = np.flatnonzero(cloud.is_flat)
@@ -92,7 +92,7 @@ def ransac_planes(cloud: PointNormals) -> Planes:
         left = left[~is_inlier]
     found.sort(key=lambda plane: -plane[2])
     normals, centers, areas = zip(*found, strict=True) if found else ((), (), ())
-    return Planes(np.reshape(normals, (-1, 3)), np.reshape(centers, (-1, 3)), np.array(areas))
+    return DominantPlanes(np.reshape(normals, (-1, 3)), np.reshape(centers, (-1, 3)), np.array(areas))
 
 
 def _are_inliers(cloud: PointNormals, some: Int64s, normals: Array, points: Array) -> Mask:
@@ -103,7 +103,7 @@ def _are_inliers(cloud: PointNormals, some: Int64s, normals: Array, points: Arra
     return np.asarray((np.abs(distances) < PLANE_TOLERANCE) & (np.abs(cosines) > np.cos(INLIER_ANGLE)))
 
 
-def find_up(octree: Octree) -> tuple[Array, float, str, Planes]:
+def find_up(octree: Octree) -> tuple[Array, float, str, DominantPlanes]:
     """Return a scan's vertical (3,), the sign of up along it or 0 if that is not plain, why, and the planes.
 
     The vertical is square to the largest area, and along it the scan is lower than it is wide.
@@ -115,7 +115,7 @@ def find_up(octree: Octree) -> tuple[Array, float, str, Planes]:
     level_areas, aligned_areas = _areas_by(planes)
     largest = int(level_areas.argmax())
     axis = _refine(planes, planes.normals[largest])
-    heights = dot(cloud.points, axis)
+    heights = dot_products(cloud.points, axis)
     places = np.einsum("ni,ji->nj", cloud.points, np.linalg.svd(axis[None])[2][1:])
     across = places @ np.linalg.eigh(np.cov(places.T))[1][:, 0]
     height, width = (np.ptp(np.quantile(x, [0.01, 0.99])) for x in (heights, across))
@@ -126,9 +126,9 @@ def find_up(octree: Octree) -> tuple[Array, float, str, Planes]:
     return axis, *find_sense(cloud, find_levels(planes, axis), axis, heights, places), planes
 
 
-def level(planes: Planes, said: Array) -> Array:
+def level(planes: DominantPlanes, said: Array) -> Array:
     """Return the vertical (3,) near a direction that is said to be up; that itself if none is, or it fits."""
-    is_near = np.abs(dot(planes.normals, said)) > np.cos(MAX_LEAN)
+    is_near = np.abs(dot_products(planes.normals, said)) > np.cos(MAX_LEAN)
     is_vertical = is_near & (_areas_by(planes)[1] > MIN_ALIGNED)
     if not is_vertical.any():
         return said
@@ -137,7 +137,7 @@ def level(planes: Planes, said: Array) -> Array:
     return said if abs(cosine) > np.cos(np.radians(0.2)) else axis * np.sign(cosine)
 
 
-def _areas_by(planes: Planes) -> tuple[Array, Array]:
+def _areas_by(planes: DominantPlanes) -> tuple[Array, Array]:
     """Return what fraction of the planes' area is level, and level or upright, by the normal of each (P,)."""
     cosines = np.abs(planes.normals @ planes.normals.T)
     areas = planes.areas / planes.areas.sum()
@@ -145,15 +145,15 @@ def _areas_by(planes: Planes) -> tuple[Array, Array]:
     return is_level @ areas, (is_level | (cosines < np.sin(LEVEL_ANGLE))) @ areas
 
 
-def _refine(planes: Planes, axis: Array) -> Array:
+def _refine(planes: DominantPlanes, axis: Array) -> Array:
     """Return the vertical (3,) by least squares on the planes that are nearly level or upright."""
-    cosines = np.abs(dot(planes.normals, axis))
+    cosines = np.abs(dot_products(planes.normals, axis))
     signs = 1.0 * (cosines < np.sin(AGREE_ANGLE)) - (cosines > np.cos(AGREE_ANGLE))
     spread = np.einsum("n,ni,nj->ij", signs * planes.areas, planes.normals, planes.normals)
     return np.asarray(np.linalg.eigh(spread)[1][:, 0])
 
 
-def wall_yaw(planes: Planes, R_level_from_scan: Array) -> float | None:
+def wall_yaw(planes: DominantPlanes, R_level_from_scan: Array) -> float | None:
     """Return the smallest turn about z [rad], in (-45, 45] deg, that puts dominant walls along x and y."""
     x, y, z = R_level_from_scan @ planes.normals.T
     is_wall = np.abs(z) < np.sin(LEVEL_ANGLE)
@@ -178,7 +178,7 @@ def find_sense(
     """
     if len(levels) < 2:
         return 0.0, "a floor and a ceiling are not both among the dominant planes"
-    is_level = cloud.is_flat & (np.abs(dot(cloud.normals, axis)) > np.cos(LEVEL_ANGLE))
+    is_level = cloud.is_flat & (np.abs(dot_products(cloud.normals, axis)) > np.cos(LEVEL_ANGLE))
     passages = passage_cue(heights, is_level, levels, places)
     cues = np.array([furniture_cue(heights, is_level, levels), passages])
     sense = float(np.sign(cues.sum()))
@@ -189,11 +189,13 @@ def find_sense(
     return (sense, reason) if is_plain else (0.0, f"floor and ceiling look alike: {reason}")
 
 
-def find_levels(planes: Planes, axis: Array) -> Array:
+def find_levels(planes: DominantPlanes, axis: Array) -> Array:
     """Return the heights (L,) of floors and ceilings along a vertical (3,), ascending, a person apart."""
-    is_level = np.abs(dot(planes.normals, axis)) > np.cos(LEVEL_ANGLE)
+    is_level = np.abs(dot_products(planes.normals, axis)) > np.cos(LEVEL_ANGLE)
     levels: list[float] = []
-    for height, area in zip(dot(planes.centers, axis)[is_level], planes.areas[is_level], strict=True):
+    for height, area in zip(
+        dot_products(planes.centers, axis)[is_level], planes.areas[is_level], strict=True
+    ):
         is_large = area > 0.3 * planes.areas[is_level][0]  # tables have less
         if is_large and all(abs(height - other) > PERSON_HEIGHT for other in levels):
             levels.append(float(height))

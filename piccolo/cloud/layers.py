@@ -97,7 +97,7 @@ def find_layers(octree: Octree, workers: Workers) -> Layers | None:
         return None
     motion = find_motion(patches)
     gaps = np.abs(patches.by_motion @ motion)
-    votes = vote(patches, patches.by_motion, motion[None])[:, 0]
+    votes = vote_on_motions(patches, patches.by_motion, motion[None])[:, 0]
     tells = (votes >= 0) & (gaps > SEEN_GAP)
     double = np.flatnonzero(tells & (votes == 1))
     share = len(double) / max(int(np.count_nonzero(tells)), 1)
@@ -173,7 +173,9 @@ def find_peaks(values: Array) -> tuple[Int64s, Int64s, Array]:
     return rows[is_small], columns[is_small], gaps[is_small]
 
 
-def vote(patches: Patches, by_motion: Array, motions: Array, some: Int64s | slice = slice(None)) -> Int8s:
+def vote_on_motions(
+    patches: Patches, by_motion: Array, motions: Array, some: Int64s | slice = slice(None)
+) -> Int8s:
     """Return (S, M), as `is_double`, what some patches say to motions (M, K); -2 of too large gaps."""
     gaps = np.abs(by_motion[some] @ motions.T)
     bins = np.minimum((gaps / BIN + 0.5).astype(np.int64), NUM_PROFILE_BINS - 1)
@@ -181,9 +183,11 @@ def vote(patches: Patches, by_motion: Array, motions: Array, some: Int64s | slic
     return np.where(gaps > LARGEST_GAP, -2, double).astype(np.int8)
 
 
-def score(patches: Patches, by_motion: Array, motions: Array, some: Int64s | slice = slice(None)) -> Array:
+def score_motions(
+    patches: Patches, by_motion: Array, motions: Array, some: Int64s | slice = slice(None)
+) -> Array:
     """Return scores (M,) of motions (M, K): double patches less those that there are by chance."""
-    votes = vote(patches, by_motion, motions, some)
+    votes = vote_on_motions(patches, by_motion, motions, some)
     charged = np.where(votes == -2, BEYOND, np.where(votes >= 0, PATCH_CHARGE, 0.0))
     return np.asarray(((votes == 1) - charged).sum(axis=0) / max(len(votes), 1))
 
@@ -196,16 +200,16 @@ def find_motion(patches: Patches) -> Array:
     drawn = draw_motions(patches, by_wall, rng)
     some = patches.is_wall
     some = rng.choice(some, min(len(some), NUM_SCORED_PATCHES), replace=False)
-    best = drawn[np.argsort(-score(patches, by_wall, drawn, some), kind="stable")[:NUM_BEST]]
+    best = drawn[np.argsort(-score_motions(patches, by_wall, drawn, some), kind="stable")[:NUM_BEST]]
     some = rng.choice(level, min(len(level), NUM_SCORED_PATCHES), replace=False)
     ends = []
     for three in best:
         motions = np.zeros((len(TRIED_HEIGHTS), 6))
         motions[:, 2:5] = three
         motions[:, 5] = TRIED_HEIGHTS
-        of_level = score(patches, patches.by_motion, motions, some) if len(some) else np.zeros(1)
-        ends.append(refine(patches, motions[of_level.argmax()]))
-    return ends[int(score(patches, patches.by_motion, np.array(ends)).argmax())]
+        of_level = score_motions(patches, patches.by_motion, motions, some) if len(some) else np.zeros(1)
+        ends.append(refine_motion(patches, motions[of_level.argmax()]))
+    return ends[int(score_motions(patches, patches.by_motion, np.array(ends)).argmax())]
 
 
 def draw_motions(patches: Patches, by_wall: Array, rng: np.random.Generator) -> Array:
@@ -226,10 +230,10 @@ def draw_motions(patches: Patches, by_wall: Array, rng: np.random.Generator) -> 
     return np.concatenate([none, found[is_likely]])
 
 
-def refine(patches: Patches, motion: Array) -> Array:
+def refine_motion(patches: Patches, motion: Array) -> Array:
     """Refine a motion (6,) on the gaps near those that it explains; return the step with the best score."""
     by_motion = patches.by_motion[patches.patch]
-    best = score(patches, patches.by_motion, motion[None])[0]
+    best = score_motions(patches, patches.by_motion, motion[None])[0]
     moved: Array = motion
     for tolerance in TOLERANCES:
         expected = by_motion @ moved
@@ -239,7 +243,7 @@ def refine(patches: Patches, motion: Array) -> Array:
         weights = weigh_absolute(gaps - expected[is_near], LEAST_GAP_RESIDUAL)
         normal_matrix = (rows * weights[:, None]).T @ rows + np.diag(MOTION_RIDGE * (weights.sum() + 1.0))
         moved = np.asarray(np.linalg.solve(normal_matrix, rows.T @ (weights * gaps)))
-        found = score(patches, patches.by_motion, moved[None])[0]
+        found = score_motions(patches, patches.by_motion, moved[None])[0]
         if found >= best:
             motion = moved
             best = found

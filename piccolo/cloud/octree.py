@@ -60,12 +60,12 @@ def build_octree(voxels: Voxels) -> Octree:
     first_child = np.full(num_nodes + 1, num_nodes, np.int32)  # leaves have none
     for level in reversed(range(NUM_LEVELS - 1)):
         begin, end = start[level : level + 2]
-        average(nodes[end : start[level + 2]], firsts[level], nodes[begin:end])
+        average_children(nodes[end : start[level + 2]], firsts[level], nodes[begin:end])
         np.add(firsts[level], end, out=first_child[begin:end])
     return Octree(nodes, first_child, start, LEAF_SIZE)
 
 
-def average(children: Array32, first: Int32s, parents: Array32) -> None:
+def average_children(children: Array32, first: Int32s, parents: Array32) -> None:
     """Write the means (M, 6) of the children (N, 6) that begin at `first` (M,)."""
     for begin in range(0, len(first), VOXELS_AT_ONCE):
         part = slice(begin, begin + VOXELS_AT_ONCE)
@@ -98,7 +98,7 @@ def recolor(octree: Octree, colors: Array32, weights: Array32) -> Octree:
         parents = np.repeat(nodes[own, 3:], np.diff(first, append=children.stop - children.start), axis=0)
         nodes[children, 3:] = np.where(loads[children, None] > 0.0, nodes[children, 3:], parents)
     for own, children, first in zip(levels[-2::-1], levels[:0:-1], firsts[::-1], strict=True):
-        average(nodes[children], first, nodes[own])
+        average_children(nodes[children], first, nodes[own])
     return octree._replace(nodes=nodes)
 
 

@@ -56,7 +56,7 @@ def unit_warnings(label: str, points: Array32) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class Cloud:
+class CloudPoints:
     """Coloured points near a local origin, in an order that does not depend on the file's."""
 
     points: Array32  # (N, 3) world minus origin_world [m], all finite, Morton order
@@ -162,7 +162,7 @@ class CloudStream:
         of_all = (*voxels.warnings, *unit_warnings(self.label, voxels.nodes[:, :3]))
         return voxels._replace(warnings=(*self._warnings(validators), *of_all))
 
-    def read(self) -> Cloud:
+    def read(self) -> CloudPoints:
         """Return all points, in Morton order.
 
         The middle of their bounding box, rounded to whole metres, becomes `origin_world` and is subtracted in
@@ -182,7 +182,7 @@ class CloudStream:
         points = points[order]
         colors = colors[order]
         warnings = (*self._warnings(validators), *unit_warnings(self.label, points))
-        return Cloud(points, colors, origin_world, warnings, self.up, self.has_colors)
+        return CloudPoints(points, colors, origin_world, warnings, self.up, self.has_colors)
 
 
 def stream_of_arrays(points: Floats, colors: Values | None, color_range: float | None = None) -> CloudStream:
@@ -332,7 +332,7 @@ def read_crs(paths: Sequence[Path]) -> str:
         head = file.read(reader.HEAD_SIZE)
     text = ""
     if head.startswith(las_file.MAGIC):
-        text = las_file.read_crs(paths[0])
+        text = las_file.read_las_crs(paths[0])
     elif head.startswith(e57_file.MAGIC):
-        text = e57_file.read_xml(paths[0]).findtext("coordinateMetadata", "")
+        text = e57_file.read_e57_xml(paths[0]).findtext("coordinateMetadata", "")
     return " ".join(text.split()) if len(text) <= reader.MAX_CRS_LENGTH else ""

@@ -15,7 +15,7 @@ from ..system.arrays import Array, Bytes, Floats, Values
 from ..system.errors import import_optional
 from ..system.files.atomic import replacing, replacing_by_library
 from ..system.jobs.memory import check_memory
-from .readers.ply import MAGIC, PlyHeader, place_of_vertices, read_columns, read_header
+from .readers.ply import MAGIC, PlyHeader, place_of_vertices, read_columns, read_ply_header
 from .readers.reader import POINTS_A_CHUNK
 from .settings import METRES
 from .stream import CloudStream
@@ -118,7 +118,7 @@ def write_transformed(
     with path.open("rb") as file:
         is_ply = file.read(len(MAGIC[0])) in MAGIC
     if is_ply and len(cloud.sources) == 1:
-        return _write_copy(cloud, read_header(path), T_target_from_source, out, finish)
+        return _write_copy(cloud, read_ply_header(path), T_target_from_source, out, finish)
     dtype = coordinate_type(cloud.box, T_target_from_source, cloud.scale)
     has_intensity = cloud.sources[0].channel == "intensity"
     with writing_ply(out) as writer:

@@ -313,7 +313,7 @@ def split_errors(problem: Problem, pose: Pose, covariance: Array) -> PoseGaussia
     return PoseGaussian(pose, (axes * np.maximum(variances, TINY_VARIANCE)) @ axes.T, common)
 
 
-def estimate_errors(problem: Problem, candidate: Candidate, workers: Workers) -> Errors:
+def estimate_pose_errors(problem: Problem, candidate: Candidate, workers: Workers) -> Errors:
     """Estimate the errors of a candidate's pose that a photo has by itself.
 
     The pose of a photo of a part of the sphere becomes the mean with that by its matches with the drawn scan,

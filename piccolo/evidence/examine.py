@@ -8,7 +8,7 @@ from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..judge.candidate import NO_CANDIDATE, Candidate, Selection
 from ..judge.selection import list_drawn, select
-from ..local_features.hypotheses import count_matches
+from ..local_features.hypotheses import count_inliers
 from ..problem.problem import Problem
 from ..problem.profile import DRAWN_VIEW
 from ..system.jobs.threads import Workers
@@ -51,7 +51,7 @@ def count_agreeing(problem: Problem, candidate: Candidate, workers: Workers) -> 
     found = verify(problem, candidate.pose, drawn.matches)
     count = found.num_matches
     if not CONFIRMED.holds(found.pose, candidate.pose):
-        agreeing = count_matches(drawn.matches, candidate.pose, problem.method.cos_agree)
+        agreeing = count_inliers(drawn.matches, candidate.pose, problem.method.cos_agree)
         count = agreeing if agreeing > problem.method.chance_matches else 0
     return replace(candidate, num_matches=count, drawn=drawn)
 

@@ -39,9 +39,9 @@ from .covariance import UNCALIBRATED, compute_acting_range
 from .lens_matches import MOST_LENS_CHANGE, MatchFit, add_matches, fit_matches
 from .scan_errors import displacement_variance
 from .self_calibration import (
-    Estimate,
     Freedom,
     FreeEnd,
+    LensEstimate,
     descend_freely,
     displace_blocks,
     estimate_corrections,
@@ -154,7 +154,7 @@ def fit_focal(problem: Problem, best: Candidate, workers: Workers, is_first: boo
     return weigh_claim(prior, camera, estimate, estimate_lens(problem, best.pose, far))
 
 
-def weigh_claim(prior: FocalPrior, camera: Camera, estimate: Estimate, free: Estimate) -> FocalFit:
+def weigh_claim(prior: FocalPrior, camera: Camera, estimate: LensEstimate, free: LensEstimate) -> FocalFit:
     """Weigh what was given of a camera against what the picture tells.
 
     That is an estimate with the focal length free, and one with all corrections of the lens free.
@@ -194,7 +194,7 @@ def list_matches(problem: Problem, candidate: Candidate, workers: Workers) -> Ma
 
 
 def average(
-    prior: FocalPrior, claim: Claim, estimate: Estimate, opinion: Opinion | None, conflict: float
+    prior: FocalPrior, claim: Claim, estimate: LensEstimate, opinion: Opinion | None, conflict: float
 ) -> tuple[Array, Array, Array]:
     """Return the mean (5,) of picture and claim, its covariance (5, 5), and what both differ too much.
 
@@ -213,7 +213,7 @@ def average(
     return total @ goal, np.asarray(total), np.linalg.inv(told.information + np.diag(wide)) - total
 
 
-def find_errors_of_picture(estimate: Estimate, claim: Claim) -> Array:
+def find_errors_of_picture(estimate: LensEstimate, claim: Claim) -> Array:
     """Return what the corrections would add to a pose's covariance (6, 6) if nothing of the claim holds."""
     told = estimate.told
     covariance = np.linalg.inv(told.information + np.diag(claim.wrong_deviations**-2.0))
@@ -306,7 +306,9 @@ def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
     return points._replace(weights=points.weights * is_kept.astype(np.float32))
 
 
-def estimate_lens(problem: Problem, pose: Pose, end: FreeEnd, by_matches: MatchFit | None = None) -> Estimate:
+def estimate_lens(
+    problem: Problem, pose: Pose, end: FreeEnd, by_matches: MatchFit | None = None
+) -> LensEstimate:
     """Estimate the corrections of a lens at the end of a descent from a pose, which tells nothing if it left.
 
     Added are errors of the picture's edge that all blocks may have in common and, as those of the matches
@@ -325,13 +327,13 @@ def estimate_lens(problem: Problem, pose: Pose, end: FreeEnd, by_matches: MatchF
     return add_errors(estimate, displace_blocks(end, variance))
 
 
-def add_errors(estimate: Estimate, errors: Array) -> Estimate:
+def add_errors(estimate: LensEstimate, errors: Array) -> LensEstimate:
     """Return an estimate with further errors (5, 5); what it does not tell stays so."""
     is_known = estimate.told.information.any(axis=1)
     covariance = invert(estimate.told.information) + errors * np.outer(is_known, is_known)
     return inform(estimate, invert(covariance))
 
 
-def inform(estimate: Estimate, information: Array) -> Estimate:
+def inform(estimate: LensEstimate, information: Array) -> LensEstimate:
     """Return an estimate that has another information (5, 5)."""
     return estimate._replace(told=estimate.told._replace(information=information))

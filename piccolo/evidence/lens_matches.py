@@ -15,7 +15,7 @@ from ..photo.camera import Mount
 from ..photo.camera.corrections import FOCAL, LENS, Corrections
 from ..problem.method import Method
 from ..system.arrays import Array
-from .self_calibration import Estimate, invert
+from .self_calibration import LensEstimate, invert
 from .verification import LEAST_ERROR
 
 MOST_LENS_CHANGE = np.array([0.5, 0.2, 0.3, 0.3, 0.6])  # corrections that are searched
@@ -34,7 +34,7 @@ class MatchFit(NamedTuple):
     pose: Pose  # in the map, with them
 
 
-def add_matches(estimate: Estimate, by_matches: MatchFit) -> Estimate:
+def add_matches(estimate: LensEstimate, by_matches: MatchFit) -> LensEstimate:
     """Return the estimate with the focal length that matches tell."""
     told = estimate.told
     of_matches = np.zeros_like(told.information)

@@ -17,7 +17,7 @@ from ..problem.problem import Problem
 from ..system.jobs.threads import Workers
 from ..views.zbuffer import visible_points
 from .contradictions import contradictions
-from .covariance import estimate_errors
+from .covariance import estimate_pose_errors
 from .focal_length import FocalFit
 from .occlusion import compare_occlusion, measure_agreement
 from .sphere import SphereFit
@@ -37,7 +37,7 @@ def measure(problem: Problem, found: Selection, fit: Fit | None, workers: Worker
     points, coarse = problem.surroundings_at(pose)
 
     measures: list[Callable[[], Any]] = [
-        partial(estimate_errors, problem, found.best, workers),  # takes longest
+        partial(estimate_pose_errors, problem, found.best, workers),  # takes longest
         partial(compare_occlusion, points, problem.given, pose),
         partial(measure_agreement, coarse, problem.photo.panorama, pose),
     ]

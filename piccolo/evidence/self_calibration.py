@@ -50,7 +50,7 @@ class FreeEnd(NamedTuple):
         return self.pose, self.values
 
 
-class Estimate(NamedTuple):
+class LensEstimate(NamedTuple):
     """Corrections by the photo and the scan alone, and how the pose moves with them."""
 
     told: Told
@@ -120,7 +120,7 @@ def descend_freely(
     return end._replace(loss=found.loss)
 
 
-def estimate_corrections(end: FreeEnd, curvature: float = CURVATURE) -> Estimate:
+def estimate_corrections(end: FreeEnd, curvature: float = CURVATURE) -> LensEstimate:
     """Estimate the corrections by photo and scan alone, with the pose free, at the end of a descent."""
     matrix = curvature * end.sums.matrices.sum(axis=0)
     shown = end.sums.weight > 0.0
@@ -131,7 +131,7 @@ def estimate_corrections(end: FreeEnd, curvature: float = CURVATURE) -> Estimate
     motion[3:] = end.pose.R_cam_from_world.T @ motion[3:]
     by_slopes = inverse[NUM_OF_POSE:]
     of_blocks = by_slopes @ end.sums.matrices[shown] @ by_slopes.T
-    return Estimate(Told(end.values, invert(covariance), of_blocks), np.asarray(motion))
+    return LensEstimate(Told(end.values, invert(covariance), of_blocks), np.asarray(motion))
 
 
 def displace_blocks(end: FreeEnd, variance: Array) -> Array:

@@ -21,7 +21,7 @@ from ..problem.problem import Problem
 from ..problem.stages import Limits
 from ..system.arrays import Array
 from ..system.jobs.threads import Workers
-from .self_calibration import Estimate, Freedom, FreeEnd, descend_freely, invert
+from .self_calibration import Freedom, FreeEnd, LensEstimate, descend_freely, invert
 
 NO_CORRECTION = np.zeros(3)
 CLAIM = Claim(
@@ -47,7 +47,7 @@ class SphereFit(NamedTuple):
     """The geometry of a panorama, with its errors."""
 
     camera: Camera  # as found, or as claimed
-    estimate: Estimate  # corrections of that by the photo and the scan alone
+    estimate: LensEstimate  # corrections of that by the photo and the scan alone
     is_claimed: bool  # the camera is as the picture claims
     conflict: float = 0.0  # deviations between claim and picture, where what is claimed is used
     doubt: float = 0.0  # probability that the claim is wrong and has pulled the pose along
@@ -91,7 +91,7 @@ def make_freedom(camera: Camera) -> Freedom:
     return Freedom(Corrections(Mount(camera)), ANY, MOST_SPHERE_CHANGE)
 
 
-def count_deviations(estimate: Estimate) -> float:
+def count_deviations(estimate: LensEstimate) -> float:
     """Return how many deviations the most contradicted correction is from what is claimed."""
     variances = np.diag(invert(estimate.told.information))
     return float((np.abs(estimate.told.values) / np.sqrt(CLAIM.deviations**2 + variances)).max())

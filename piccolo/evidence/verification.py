@@ -17,7 +17,7 @@ from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
 from ..geometry.pose_gaussian import LOOSE, differentiate_rays
 from ..geometry.sphere import compute_indices
 from ..judge.candidate import Drawn
-from ..local_features.hypotheses import COS_EXACT, LEAST_MATCHES, count_matches, exact_pose, find_inliers
+from ..local_features.hypotheses import COS_EXACT, LEAST_MATCHES, count_inliers, exact_pose, find_inliers
 from ..local_features.keypoints import Keypoints, find_in_view, join_keypoints
 from ..local_features.matching import (
     NO_MATCHES,
@@ -63,7 +63,7 @@ def verify(problem: Problem, pose: Pose, drawn: Matches) -> Verified:
     if found is None:
         return Verified(pose, 0)
     cos_agree = problem.method.cos_agree
-    return Verified(found.pose, max(count_matches(matches, found.pose, cos_agree) for matches in pictures))
+    return Verified(found.pose, max(count_inliers(matches, found.pose, cos_agree) for matches in pictures))
 
 
 def place_by_matches(method: Method, pose: Pose, matches: Matches) -> tuple[Pose, Array] | None:

@@ -48,7 +48,7 @@ class Claim(NamedTuple):
         scores = S @ (told.values - self.expected)
         inverse = np.sqrt(np.maximum(np.diag(S), 1e-300))
         of_picture = np.maximum(1.0 - np.einsum("ij,ij,i->j", S, S, 1.0 / np.diag(P)) / inverse**2, 0.0)
-        freedom = count_freedom(told.of_blocks, S) / np.maximum(of_picture, 1e-6) ** 2
+        freedom = count_variance_freedom(told.of_blocks, S) / np.maximum(of_picture, 1e-6) ** 2
         return np.sign(scores) * as_normal(np.abs(scores) / inverse, freedom), np.asarray(inverse)
 
     def doubt(self, told: Told) -> float:
@@ -64,7 +64,7 @@ class Claim(NamedTuple):
         return float(np.abs(self.contradict(told)[0]).max())
 
 
-def count_freedom(of_blocks: Array, weights: Array) -> Array:
+def count_variance_freedom(of_blocks: Array, weights: Array) -> Array:
     """Return the degrees of freedom (n,) of the variances of sums of corrections, weighed by (p, n).
 
     They are those by Satterthwaite (1946) for an estimate from blocks (Bell and McCaffrey, 2002).

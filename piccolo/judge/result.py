@@ -16,7 +16,7 @@ from ..photo.photo import GpsPrior
 from ..problem.accuracy import Accuracy, Demand
 from ..system.arrays import Array
 from ..system.errors import printable
-from ..system.files.json_file import document_of
+from ..system.files.json_file import reading_document
 from .accuracy_hint import explain_accuracy
 from .belief import NOTHING, UNCONFIRMED, Belief, decide
 from .pose_covariance import PoseCovariance
@@ -311,7 +311,7 @@ class Result:
         """Return the result that `to_json` wrote. Raises InputError for any other text."""
         from msgspec import convert  # noqa: PLC0415  only who reads results waits for it
 
-        with document_of(text, FORMAT, "result") as document:
+        with reading_document(text, FORMAT, "result") as document:
             walk = document["walk"]
             alone = walk and walk["alone"]
             if alone:

@@ -118,7 +118,7 @@ def write_turned(m: Matches, j: int, R: Array) -> None:
 
 
 @inline_kernel
-def count_agreeing(m: Matches, R: Array, t: Array) -> int:
+def count_roughly_agreeing(m: Matches, R: Array, t: Array) -> int:
     """Count the photo's features of which a match roughly agrees with a pose."""
     count = 0
     last = -1
@@ -139,7 +139,7 @@ def rough_poses(matches: Matches, voters: Int64s, rotations: Array, centers: Arr
         for i in range(3):
             centers[k, i] = m.points[j, i] - distance * m.directions[j, i]
         write_turned(m, j, rotations[k])
-        votes[k] = count_agreeing(m, rotations[k], centers[k])
+        votes[k] = count_roughly_agreeing(m, rotations[k], centers[k])
 
 
 @kernel
@@ -206,7 +206,7 @@ def find_inliers(matches: Matches, pose: Pose, cos_rough: float) -> Int64s:
     return members[: list_members(matches, pose.R_cam_from_world, pose.center_world, cos_rough, members)]
 
 
-def count_matches(matches: Matches, pose: Pose, cos_agree: float = COS_EXACT) -> int:
+def count_inliers(matches: Matches, pose: Pose, cos_agree: float = COS_EXACT) -> int:
     """Count the features of the photo that a pose puts where the map has them, within an angle."""
     return len(np.unique(matches.query[find_inliers(matches, pose, cos_agree)]))
 
@@ -227,7 +227,7 @@ def exact_pose(matches: Matches, rough: Pose) -> MatchedPose | None:
     pose = Pose(rotations[best], centers[best])
     for _ in range(2):
         pose = refine_on(matches, pose, REFINEMENTS)
-    return MatchedPose(pose, count_matches(matches, pose))
+    return MatchedPose(pose, count_inliers(matches, pose))
 
 
 def refine_on(matches: Matches, pose: Pose, num_steps: int) -> Pose:

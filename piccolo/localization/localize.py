@@ -174,7 +174,7 @@ def localize_guessed(
     return select_likeliest(found, settings)
 
 
-def is_same_place(one: Result, pose: Pose, focal: FocalLength | None) -> bool:
+def is_same_but_for_focal(one: Result, pose: Pose, focal: FocalLength | None) -> bool:
     """Return True if a pose is a result's up to a move along the view that their focal lengths explain."""
     own = one.best_pose
     if own is None:
@@ -192,7 +192,7 @@ def select_likeliest(found: Sequence[Result], settings: CoarseToFineSettings) ->
     places: list[Result] = []
     for one in sorted(found, key=lambda f: -f.confidence):
         pose = one.best_pose
-        if not any(pose is None or is_same_place(f, pose, one.focal_length) for f in places):
+        if not any(pose is None or is_same_but_for_focal(f, pose, one.focal_length) for f in places):
             places.append(one)
     best, *elsewhere = places
     others = [

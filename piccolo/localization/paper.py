@@ -25,7 +25,7 @@ from ..system.arrays import Array, Array32, Mask
 from ..system.errors import InputError
 from ..system.jobs.threads import Stopwatch, Workers
 from ..views.zbuffer import is_free_space, render_view, visible_points
-from .paper_descent import DescentSettings, Loss, Refined, make_sampling_loss, refine
+from .paper_descent import DescentSettings, Loss, Refined, make_sampling_loss, refine_by_solver
 
 # No covariance is known here, and too few alternatives to tell places that repeat: a rough guide, by margin
 # and log of the agreement, learnt without such places.
@@ -164,7 +164,7 @@ class PaperMap(LocalCloud):
     scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
 
 
-def prepare(cloud: LocalCloud, settings: PaperSettings) -> PaperMap:
+def prepare_by_paper(cloud: LocalCloud, settings: PaperSettings) -> PaperMap:
     """Prepare everything that does not depend on the panorama."""
     points = cloud.points.subsample(settings.max_points)
     positions = free_grid(points, settings.num_translations, settings.grid_margin)
@@ -199,7 +199,7 @@ def search(
     return best_distinct(by_histogram, settings.num_by_histogram, near)
 
 
-def localize(
+def localize_by_paper(
     paper_map: PaperMap, panorama: Panorama, settings: PaperSettings, workers: Workers, watch: Stopwatch
 ) -> Result:
     """Localize by Algorithm 1 of the paper: search, refine, select; then evaluate the selected pose."""
@@ -208,29 +208,31 @@ def localize(
     with watch.stage("search"):
         starts = search(paper_map, panorama, loss, settings, workers)
     with watch.stage("refine"):
-        refined = list(workers.map(lambda s: refine(points, loss, s.pose, settings), starts, "refine"))
+        refined = list(
+            workers.map(lambda s: refine_by_solver(points, loss, s.pose, settings), starts, "refine")
+        )
         best = min(refined, key=lambda r: r.loss, default=None)
     if best is None or not np.isfinite(best.loss):
         return nothing_found()
     with watch.stage("refine"):
-        evidence, others = evaluate(points, panorama, best, refined)
+        evidence, others = evaluate_best(points, panorama, best, refined)
     found = Result(
         best_pose=paper_map.to_world(best.pose),
         loss=best.loss,
         evidence=evidence,
         alternatives=tuple(Alternative(paper_map.to_world(h.pose), h.score) for h in others),
     )
-    return found.take_belief(believe(evidence, len(others)), settings.min_confidence)
+    return found.take_belief(believe_roughly(evidence, len(others)), settings.min_confidence)
 
 
-def believe(evidence: Evidence, num_others: int) -> Belief:
+def believe_roughly(evidence: Evidence, num_others: int) -> Belief:
     """Return a rough belief in the best pose and in others, which share alike what their scores cost it."""
     best = paper_confidence(evidence)
     alone = paper_confidence(replace(evidence, margin=1.0))
     return make_belief([best, *[(alone - best) / max(num_others, 1)] * num_others])
 
 
-def evaluate(
+def evaluate_best(
     points: PackedPoints, panorama: Panorama, best: Refined, refined: list[Refined]
 ) -> tuple[Evidence, list[Hypothesis]]:
     """Return the evidence at the best pose, and the alternatives, best first."""

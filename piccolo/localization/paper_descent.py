@@ -143,7 +143,7 @@ def descend_gauss_newton(objective: Objective, start: Pose, num_iterations: int)
     return best
 
 
-def refine(points: PackedPoints, loss: Loss, start: Pose, settings: DescentSettings) -> Refined:
+def refine_by_solver(points: PackedPoints, loss: Loss, start: Pose, settings: DescentSettings) -> Refined:
     """Descend from `start`, leaving out the points hidden from the camera; these are found `num_culls` times.
 
     That changes the function, so losses before and after it are not comparable: the result is the best pose

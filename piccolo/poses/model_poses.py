@@ -19,7 +19,7 @@ NamedPose = tuple[str, Pose]
 Transform = tuple[str, Array]  # T_cam_from_world, or T_world_from_cam (3 or 4, 4)
 
 
-class Form(NamedTuple):
+class JsonForm(NamedTuple):
     """A format of poses in JSON."""
 
     is_of: Callable[[Any], bool]
@@ -93,10 +93,10 @@ def _has(*fields: str) -> Callable[[Any], bool]:
 
 
 FORMS = (
-    Form(is_reconstruction, _of_opensfm, OPTICAL_FROM_CAM, True, "unknown"),
-    Form(_has("sfm_data_version", "extrinsics"), _of_openmvg, OPTICAL_FROM_CAM, True, "unknown"),
-    Form(_has("views", "poses"), _of_meshroom, OPTICAL_FROM_CAM, True, "unknown"),
-    Form(_has("frames"), _of_transforms, OPENGL_FROM_CAM, False, "metres"),
+    JsonForm(is_reconstruction, _of_opensfm, OPTICAL_FROM_CAM, True, "unknown"),
+    JsonForm(_has("sfm_data_version", "extrinsics"), _of_openmvg, OPTICAL_FROM_CAM, True, "unknown"),
+    JsonForm(_has("views", "poses"), _of_meshroom, OPTICAL_FROM_CAM, True, "unknown"),
+    JsonForm(_has("frames"), _of_transforms, OPENGL_FROM_CAM, False, "metres"),
 )
 
 

@@ -58,7 +58,7 @@ def read_relative_poses(path: Path, photos: Sequence[Path]) -> list[Pose | None]
     return found
 
 
-def find_scale(path: Path) -> RelativeScale:
+def find_file_scale(path: Path) -> RelativeScale:
     """Return the unit of a file's positions: structure from motion, as in COLMAP's files, has none."""
     if path.suffix in SUFFIXES:
         return read_json_poses(path, WANTED)[1]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from ..evidence.covariance import estimate_errors
+from ..evidence.covariance import estimate_pose_errors
 from ..evidence.examine import complete, examine
 from ..judge.candidate import Selection
 from ..judge.result import Result
@@ -44,13 +44,13 @@ def localize_among(
     Returns those that are found by others, by their numbers. A photo that is not sure is searched again if
     others put it anywhere.
     """
-    keypoints = {k: find_keypoints(scan_map, photo, workers, watch) for k, photo in enumerate(photos)}
+    keypoints = {k: list_keypoints(scan_map, photo, workers, watch) for k, photo in enumerate(photos)}
     with watch.stage("match"):
         numbers = list_asked(keypoints, {k for k, photo in enumerate(photos) if photo.is_open}, workers)
     if not numbers:
         return {}
     check_photos(len(numbers))
-    known = ((k, recall(scan_map, photos[k], workers, watch)) for k in numbers)
+    known = ((k, recall_found(scan_map, photos[k], workers, watch)) for k in numbers)
     members = {k: member for k, member in known if member is not None}
     with watch.stage("match"):
         placed = list_placed(members, {k for k in members if photos[k].is_open}, workers)
@@ -59,7 +59,7 @@ def localize_among(
     settings = photos[numbers[0]].settings
     means = Means(settings.effort, workers, watch)
     for k in [k for k in members if photos[k].is_open]:
-        member = search(scan_map, photos[k], means) if k in placed else None
+        member = search_again(scan_map, photos[k], means) if k in placed else None
         if member is None:
             del members[k]
         else:
@@ -69,7 +69,7 @@ def localize_among(
     return {k: one for k, one in found.items() if photos[k].is_open and one.others}
 
 
-def find_keypoints(scan_map: ScanMap, photo: Known, workers: Workers, watch: Stopwatch) -> Keypoints | None:
+def list_keypoints(scan_map: ScanMap, photo: Known, workers: Workers, watch: Stopwatch) -> Keypoints | None:
     """Return a photo's keypoints; None if it is not searched, or not by them."""
     panorama = photo.take()
     if panorama is None:
@@ -88,7 +88,7 @@ def list_asked(keypoints: Mapping[int, Keypoints | None], unsure: set[int], work
     return sorted({k for two in pairs if not unsure.isdisjoint(two) for k in two})
 
 
-def recall(scan_map: ScanMap, photo: Known, workers: Workers, watch: Stopwatch) -> Member | None:
+def recall_found(scan_map: ScanMap, photo: Known, workers: Workers, watch: Stopwatch) -> Member | None:
     """Return a photo as it was found, by its result; None if it is another, or nothing is known."""
     panorama = photo.take()
     result = photo.result
@@ -99,13 +99,13 @@ def recall(scan_map: ScanMap, photo: Known, workers: Workers, watch: Stopwatch) 
         known = [result.best_pose, *(alternative.pose for alternative in result.alternatives)]
         best, *others = [examine(problem, scan_map.from_world(pose)) for pose in known]
         found = complete(problem, Selection(best, tuple(others)), workers)
-        errors = estimate_errors(problem, found.best, workers)
+        errors = estimate_pose_errors(problem, found.best, workers)
         gaussian = recall_gaussian(problem, best.pose, result.covariance) or errors.gaussian
         alone = replace(result, gaussian=gaussian, std_of_fit=errors.std_of_fit)
         return Member(Found(problem, found, None).forget(), alone)
 
 
-def search(scan_map: ScanMap, photo: Known, means: Means) -> Member | None:
+def search_again(scan_map: ScanMap, photo: Known, means: Means) -> Member | None:
     """Search a photo again by itself; None if it is another."""
     panorama = photo.take()
     if panorama is None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..evidence.covariance import estimate_errors
+from ..evidence.covariance import estimate_pose_errors
 from ..evidence.examine import complete, count_agreeing, examine
 from ..evidence.verification import draw_near, verify
 from ..geometry.nearness import ONE_IN_BUNDLE, RIGHT
@@ -212,7 +212,7 @@ def estimate_errors_at(member: Member, problem: Problem, found: Candidate, worke
         return Errors(member.alone.gaussian, member.alone.std_of_fit)
     is_counted = not problem.profile.is_narrow or found.num_matches is not None
     counted = found if is_counted else count_agreeing(problem, found, workers)
-    errors = estimate_errors(problem, counted, workers)
+    errors = estimate_pose_errors(problem, counted, workers)
     fit = member.found.fit
     return errors.widen(fit.pose_covariance) if fit else errors
 

@@ -18,7 +18,7 @@ from ..geometry.pose_gaussian import LIKELY, PoseGaussian
 from ..judge.by_others import LOCAL_ERRORS, MISSED, Shares
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result
-from ..local_features.hypotheses import count_matches
+from ..local_features.hypotheses import count_inliers
 from ..localization.means import Means
 from ..problem.accuracy import Demand
 from ..scan_map.scan_map import ScanMap
@@ -174,7 +174,7 @@ def propose_places(group: Group, numbers: Collection[int]) -> list[Places]:
         if not is_known and len(found) < MOST_SPREAD:
             anchor = {number: group.links.place(number, pose)}
             found.append(spread(group.links, anchor, numbers, FIRM))
-    settled = [settle(group, places, numbers) for places in join_bridged(group.links, found)]
+    settled = [settle_group(group, places, numbers) for places in join_bridged(group.links, found)]
     kept: list[Places] = []
     for places in sorted(settled, key=lambda places: -count_votes(group, places)):
         if len(places) > 1 and not any(is_same_place(places, other) for other in kept):
@@ -211,7 +211,7 @@ def count_votes(group: Group, places: Places) -> float:
     return sum(find_own(group.members[k], placed.pose)[1] for k, placed in places.items())
 
 
-def settle(group: Group, places: Places, numbers: Collection[int]) -> Places:
+def settle_group(group: Group, places: Places, numbers: Collection[int]) -> Places:
     """Place the photos again, by those whose own poses are likely and where they are expected to be."""
     own = {k: find_own(group.members[k], placed.pose) for k, placed in places.items()}
     anchors = {
@@ -364,7 +364,7 @@ def expect_all(links: Links, places: Places, own: Mapping[int, PoseGaussian]) ->
     expected: dict[int, Expected] = {}
     for number in [*known, *(k for k in places if k not in known)]:
         rest = {k: gaussian for k, gaussian in known.items() if k != number}
-        found = expect(links, number, {k: located[k] for k in rest}, rest)
+        found = expect_by_matches(links, number, {k: located[k] for k in rest}, rest)
         if found is not None:
             expected[number] = found
             if number not in known:
@@ -373,7 +373,9 @@ def expect_all(links: Links, places: Places, own: Mapping[int, PoseGaussian]) ->
     return expected
 
 
-def expect(links: Links, number: int, located: Places, known: Mapping[int, PoseGaussian]) -> Expected | None:
+def expect_by_matches(
+    links: Links, number: int, located: Places, known: Mapping[int, PoseGaussian]
+) -> Expected | None:
     """Return the pose of a photo by its matches with others; None if too few agree.
 
     Its errors are those of the matches, and of the poses of the photos that tell the most; if few matches
@@ -385,7 +387,7 @@ def expect(links: Links, number: int, located: Places, known: Mapping[int, PoseG
     found = find_pose(parts.values(), [known[k].pose for k in parts], WEAK, links.workers)
     if found is None:
         return None
-    counts = {k: count_matches(matches, found.pose) for k, matches in parts.items()}
+    counts = {k: count_inliers(matches, found.pose) for k, matches in parts.items()}
     telling = {k: counts[k] / known[k].largest_std ** 2 for k in parts}
     sources = sorted(telling, key=lambda k: -telling[k])[:MOST_SOURCES]
     shares = np.array([telling[k] for k in sources]) / sum(telling[k] for k in sources)

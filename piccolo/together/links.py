@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..evidence.verification import find_ranges
 from ..geometry.pose import Pose, rotate_points
 from ..geometry.sphere import compute_indices
-from ..local_features.hypotheses import count_matches, propose_poses
+from ..local_features.hypotheses import count_inliers, propose_poses
 from ..local_features.keypoints import Keypoints
 from ..local_features.matching import Located, Matches, match_pictures, merge_matches, pair
 from ..problem.problem import Problem
@@ -184,7 +184,7 @@ def are_bridged(links: Links, one: Places, other: Places) -> bool:
     if one.keys() & other.keys():
         return False
     counts = (
-        count_matches(matches, placed.pose)
+        count_inliers(matches, placed.pose)
         for number, placed in one.items()
         for matches in links.match(number, other).values()
     )

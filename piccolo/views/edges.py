@@ -33,7 +33,7 @@ def find_sides(num_rings: int) -> tuple[Int32s, Array32]:
     return cells, np.round(weights, 4)  # 0 of what rounding alone reaches
 
 
-def draw_edges(sums: Array32, num_rings: int) -> None:
+def replace_by_edges(sums: Array32, num_rings: int) -> None:
     """Replace the colours in the sums (N, 8) of a view, as of `average_nodes`, by edges; their grey stays."""
     cells, weights = find_sides(num_rings)
 

@@ -143,7 +143,7 @@ def sample_visible(
     return count
 
 
-def visible_points(
+def sample_visible_points(
     octree: Octree, center_map: Center, config: ViewConfig, shown: bytes, cone: Cone, count: int
 ) -> Cells:
     """Return what is seen from a centre (3,) [m] as at most `count` points of equal weights, not as cells.
@@ -182,7 +182,7 @@ class RecentViews:
             partial(average_view, averaged or octree)
         )
         self.points: Callable[[Place, ViewConfig, bytes, Cone, int], Cells] = lru_cache(NUM_POINT_SETS)(
-            partial(visible_points, octree)
+            partial(sample_visible_points, octree)
         )
         self.surroundings: Callable[[Place, float], PackedPoints] = lru_cache(NUM_SURROUNDINGS)(
             partial(points_around, octree)

@@ -15,7 +15,7 @@ from ..geometry.sphere import BLOCK_RINGS, PI, atan2, find_cell, interpolation, 
 from ..photo.panorama.local_normalization import mean_and_inverse_std, opponent, zscore
 from ..system.arrays import Array, Array32, Floats, Int32s, Mask
 from ..system.kernels.jit import F0, F1, HALF, kernel, whole
-from .edges import draw_edges
+from .edges import replace_by_edges
 from .zbuffer import VISIBLE_FACTOR
 
 VIEWS_A_TASK = 64  # views that a thread makes at a time
@@ -281,7 +281,7 @@ def normalize_cells(
 
 
 @kernel
-def nearest_ranges(
+def nearest_node_ranges(
     tree: Octree, centers: Floats, voxel_per_range: float, view: ViewArrays, scratch: Scratch, ranges: Array32
 ) -> None:
     """Write ranges [m] of the nearest nodes in the cells (n, cells) around each centre (n, 3), 0 for none."""
@@ -316,7 +316,7 @@ def average_view(octree: Octree, center_map: Center, config: ViewConfig, cone: C
     center = np.asarray(center_map, np.float64)
     average_nodes(octree, center, config.voxel_per_range, config.arrays, cone, thread_scratch(), sums)
     if config.draws_edges:
-        draw_edges(sums, config.num_rings)
+        replace_by_edges(sums, config.num_rings)
     return sums
 
 
@@ -337,5 +337,5 @@ def ranges_around(octree: Octree, centers_map: Floats, config: ViewConfig) -> Ar
     """Return the range [m] of the nearest node in each cell around each centre: (n, cells), 0 for none."""
     ranges = np.empty((len(centers_map), len(make_grid(config.num_rings))), np.float32)
     centers_map = np.ascontiguousarray(centers_map)  # one kernel for all
-    nearest_ranges(octree, centers_map, config.voxel_per_range, config.arrays, thread_scratch(), ranges)
+    nearest_node_ranges(octree, centers_map, config.voxel_per_range, config.arrays, thread_scratch(), ranges)
     return ranges

@@ -39,7 +39,7 @@ class ViewImage(NamedTuple):
 
 
 @inline_kernel
-def project(
+def project_direction(
     x: Scalar, y: Scalar, z: Scalar, r: Scalar, focal: Scalar, height: int, width: int
 ) -> tuple[Any, Any, Any, Any]:
     """Return the pixel u, v of a direction of length r, the pixels a radian there, and its radius.
@@ -84,7 +84,7 @@ def project_voxels(
     for k in range(count):
         x, y, z = rotate(R_cam_from_map, (pixels[0, k], pixels[1, k], pixels[2, k]))
         r: Any = math.sqrt(x * x + y * y + z * z)
-        u, v, px_per_rad, rho = project(x, y, z, r, focal, height, width)
+        u, v, px_per_rad, rho = project_direction(x, y, z, r, focal, height, width)
         is_outside = u < F0 or v < F0 or u >= np.float32(width) or v >= np.float32(height)
         if focal > F0 and is_outside:
             continue

@@ -17,7 +17,7 @@ from piccolo.judge.probability import LOCALIZED
 from piccolo.judge.result import Result
 from piccolo.system.arrays import Array
 from piccolo.system.errors import InputError, printable
-from piccolo.system.files.json_file import document_of, parse_lines, read_bytes
+from piccolo.system.files.json_file import parse_lines, read_bytes, reading_document
 from piccolo.system.files.line_file import whole_size
 
 from ..scene import Query, Scene, document_of_pose, pose_of
@@ -109,7 +109,7 @@ class QueryResult:
     @classmethod
     def from_json(cls, text: str) -> "QueryResult":
         """Read back what `to_json` wrote; any other text is an InputError."""
-        with document_of(text, FORMAT, "evaluation") as row:
+        with reading_document(text, FORMAT, "evaluation") as row:
             true_pose = None if row["true_pose"] is None else pose_of(row["true_pose"])
             scene = str(row["scene"])
             image = str(row["image"])

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 import piccolo
-from piccolo.cloud.stream import Cloud, open_cloud
+from piccolo.cloud.stream import CloudPoints, open_cloud
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import Gravity, Pose, yaw_rotation
@@ -151,7 +151,7 @@ def medians(contenders: dict[str, Callable[[], object]], num_rounds: int) -> dic
     return {name: float(np.median(values)) for name, values in seconds.items()}
 
 
-def kernel_table(cloud: Cloud, rgb: Bytes) -> Table:
+def kernel_table(cloud: CloudPoints, rgb: Bytes) -> Table:
     """Time the kernels on a scan and a panorama (H, W, 3), the camera at the middle of the points.
 
     The reference is cv2.remap: 8-bit, 3 channels, bilinear, one thread, a coherent map, a pixel a point.

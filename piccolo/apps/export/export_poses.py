@@ -13,7 +13,7 @@ from ...geometry.pose import CAMERA_AXES
 from ...system.errors import InputError
 from .faces import FACES
 from .formats import FORMATS, export
-from .posed_images import Options, Selection, offset_file, select
+from .posed_images import Options, SelectedResults, offset_file, select_results
 from .reconstructions import points_file
 from .scan_points import open_scan_of
 
@@ -87,7 +87,7 @@ def options_from(arguments: Arguments) -> Options:
     return Options(**own)
 
 
-def notes_on(selection: Selection) -> Iterable[str]:
+def notes_on(selection: SelectedResults) -> Iterable[str]:
     """Yield notes for the user: what was left out, and what may be mixed up."""
     if selection.left_out:
         num_left_out = sum(selection.left_out.values())
@@ -119,7 +119,7 @@ def main(arguments: Arguments) -> int:
     outputs = {"--out": arguments.out, "the offset": beside, "the points": points}
     files = {Path(name) for result in results for name in (result.pano, result.cloud_name)}
     check_distinct(outputs, [*arguments.results, *files])
-    selection = select(results, arguments.cloud, arguments.all)
+    selection = select_results(results, arguments.cloud, arguments.all)
     for note in (*notes_on(selection), *check_content(arguments, selection.results)):
         arguments.note(note)
     if options.points is not None:

@@ -87,7 +87,7 @@ class Format(NamedTuple):
     data_set: tuple[str, str] = ("", "")  # of faces: path of the model, and of the folder that names begin in
 
 
-class Selection(NamedTuple):
+class SelectedResults(NamedTuple):
     """The results to write, and how many others were left out for which reason."""
 
     results: tuple[Result, ...]
@@ -99,7 +99,9 @@ class Selection(NamedTuple):
         return {result.source.cloud_sha256 or result.cloud_name: result.cloud_name for result in self.results}
 
 
-def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool = False) -> Selection:
+def select_results(
+    results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool = False
+) -> SelectedResults:
     """Return the results, of `clouds` only if given, that are localized, or all that have a pose."""
     known = {result.cloud_name for result in results}
     if missing := [cloud for cloud in clouds if cloud not in known]:
@@ -116,7 +118,7 @@ def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool 
             left_out[result.status] += 1
         else:
             chosen.append(result)
-    return Selection(tuple(chosen), dict(left_out))
+    return SelectedResults(tuple(chosen), dict(left_out))
 
 
 def select_images(

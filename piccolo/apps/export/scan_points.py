@@ -23,7 +23,7 @@ from .posed_images import Options, PosedImage
 MORE = 4  # times as many points are looked at as are kept
 
 
-class Seen(NamedTuple):
+class SeenPoints(NamedTuple):
     """The points that a picture shows."""
 
     points: Int64s  # (M,) their numbers
@@ -35,7 +35,7 @@ class ScanPoints(NamedTuple):
 
     xyz: Array  # (N, 3) [m] in the world, less the offset
     rgb: Bytes  # (N, 3)
-    seen: list[Seen]
+    seen: list[SeenPoints]
 
 
 def open_scan_of(results: Sequence[Result], workers: Workers) -> LocalCloud:
@@ -60,7 +60,7 @@ def find_points(images: Sequence[PosedImage], options: Options) -> ScanPoints:
     A point counts as shown where no surface of the scan is in front of it.
     """
     if options.points is None or options.scan is None:
-        nothing = Seen(np.empty(0, np.int64), np.empty((0, 2)))
+        nothing = SeenPoints(np.empty(0, np.int64), np.empty((0, 2)))
         return ScanPoints(np.empty((0, 3)), np.empty((0, 3), np.uint8), [nothing] * len(images))
     cloud = options.scan
     offset = np.array(options.offset or (0.0, 0.0, 0.0))
@@ -86,9 +86,9 @@ def find_points(images: Sequence[PosedImage], options: Options) -> ScanPoints:
     return ScanPoints(xyz[kept], unpack_rgb(few.rgbx[kept]), seen)
 
 
-def _project(image: PosedImage, xyz: Array, visible: dict[bytes, Mask]) -> Seen:
+def _project(image: PosedImage, xyz: Array, visible: dict[bytes, Mask]) -> SeenPoints:
     """Return those of points (N, 3) that are visible from a picture's centre and in the picture."""
     numbers = np.flatnonzero(visible[image.pose.center_world.tobytes()])
     x_cam = rotate_points(xyz[numbers] - image.pose.center_world, image.pose.R_cam_from_world)
     pixels, is_in = image.lens.pixels(x_cam)
-    return Seen(numbers[is_in], pixels[is_in])
+    return SeenPoints(numbers[is_in], pixels[is_in])

@@ -92,7 +92,7 @@ class Report(NamedTuple):
     warnings: tuple[str, ...]  # photos of which there are no pictures, and why
 
 
-class Task(NamedTuple):
+class PictureTask(NamedTuple):
     """A photo whose pictures are to be made."""
 
     entry: site.Entry
@@ -119,7 +119,7 @@ def build_report(
         photos = PhotoFolder(None if settings.images is None else Path(settings.images))
         tasks = [make_task(entry, scan_map, settings, photos) for entry in entries]
         warnings = (*filter(None, [note]), *write_pictures(tasks, scan_map, folder, settings, workers))
-        document = {**document_of(tasks, scan_map, folder, settings), "note": note}
+        document = {**make_document(tasks, scan_map, folder, settings), "note": note}
         if not settings.self_contained:
             site.finish_folder(folder, document)
             return Report(out / "index.html", document, warnings)
@@ -140,7 +140,9 @@ def check_settings(settings: ReportSettings, scan_map: ScanMap, entries: Sequenc
     return check_scan(results, scan_map.scan_sha256, "that given", settings.force)
 
 
-def make_task(entry: site.Entry, scan_map: ScanMap, settings: ReportSettings, folder: PhotoFolder) -> Task:
+def make_task(
+    entry: site.Entry, scan_map: ScanMap, settings: ReportSettings, folder: PhotoFolder
+) -> PictureTask:
     """Return what is to be done for a result; its key is of all that its pictures depend on."""
     result = entry.result
     photo = folder.guess(result.pano)
@@ -151,7 +153,7 @@ def make_task(entry: site.Entry, scan_map: ScanMap, settings: ReportSettings, fo
         problem = str(error)
     parts = result.to_json(), digest, scan_map.scan_sha256, repr(settings.width), digest_of_sources(MAKERS)
     key = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
-    return Task(entry, photo, key, list_poses(result, scan_map.from_world), problem)
+    return PictureTask(entry, photo, key, list_poses(result, scan_map.from_world), problem)
 
 
 def list_poses(result: Result, from_world: Callable[[Pose], Pose]) -> list[Pose]:
@@ -167,7 +169,7 @@ def draw_surfels(points: PackedPoints, workers: Workers) -> tuple[Surfels, Packe
 
 
 def write_pictures(
-    tasks: Sequence[Task], scan_map: ScanMap, folder: Path, settings: ReportSettings, workers: Workers
+    tasks: Sequence[PictureTask], scan_map: ScanMap, folder: Path, settings: ReportSettings, workers: Workers
 ) -> tuple[str, ...]:
     """Make the pictures that are not there yet; why some could not be made."""
     readable = [task for task in tasks if task.entry.result.status not in (UNREADABLE, FAILED)]
@@ -181,7 +183,7 @@ def write_pictures(
         points = scan_map.points.subsample(MAX_SURFELS)
         scan = Surfels(points, np.empty((0, 3), np.float32), np.empty(0, np.float32)), points
 
-    def write(task: Task) -> str:
+    def write(task: PictureTask) -> str:
         if task.problem:
             return task.problem
         try:
@@ -199,8 +201,8 @@ def write_pictures(
         return tuple(warning for warning in workers.map(write, taken, "photos") if warning)
 
 
-def document_of(
-    tasks: Sequence[Task], scan_map: ScanMap, folder: Path, settings: ReportSettings
+def make_document(
+    tasks: Sequence[PictureTask], scan_map: ScanMap, folder: Path, settings: ReportSettings
 ) -> dict[str, Any]:
     """All that the page knows at once; writes the plans."""
     names = site.unique_names([task.entry for task in tasks])

@@ -156,12 +156,12 @@ def make_thumbnail(panorama: Panorama, pose: Pose | None) -> bytes:
     """JPEG of what lies ahead of the camera; level if the pose is known."""
     width, height = THUMB_SIZE
     camera = pinhole(width, height, 0.5 * width / math.tan(math.radians(0.5 * THUMB_FOV_DEG)))
-    R_lens_from_cam = np.eye(3) if pose is None else level(pose.R_cam_from_world)
+    R_lens_from_cam = np.eye(3) if pose is None else level_lens(pose.R_cam_from_world)
     small = shrink(panorama, 4 * width)
     return encode_image(cut(small.rgb, camera, R_lens_from_cam), ".jpg", THUMB_QUALITY)
 
 
-def level(R_cam_from_world: Array) -> Array:
+def level_lens(R_cam_from_world: Array) -> Array:
     """R_lens_from_cam (3, 3) of a level lens that looks where the image centre does."""
     yaw = math.atan2(R_cam_from_world[0, 1], R_cam_from_world[0, 0])
     return np.asarray(yaw_rotation(yaw) @ R_cam_from_world.T)

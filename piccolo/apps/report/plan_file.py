@@ -16,7 +16,7 @@ from ...scan_map.scan_map import ScanMap
 from ...system.arrays import Array
 from ...system.errors import import_optional
 from ...system.files.atomic import temporary_folder, write_atomically
-from .build import ReportSettings, Task, check_settings, document_of
+from .build import PictureTask, ReportSettings, check_settings, make_document
 from .site import Entry, begin_folder
 
 DXF = ".dxf"
@@ -78,8 +78,8 @@ def write_plan_file(entries: Sequence[Entry], scan_map: ScanMap, out: Path, sett
     suffix = out.suffix.lower()
     with temporary_folder() as folder:
         begin_folder(folder)
-        tasks = [Task(entry, Path(), "", []) for entry in entries]
-        document = document_of(tasks, scan_map, folder, settings)
+        tasks = [PictureTask(entry, Path(), "", []) for entry in entries]
+        document = make_document(tasks, scan_map, folder, settings)
         content = make_dxf(document) if suffix == DXF else draw_figure(document, folder, suffix[1:])
     write_atomically(out, content)
     return len(document["storeys"])

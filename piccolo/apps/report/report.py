@@ -58,7 +58,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--cache FOLDER", CACHE_TEXT)
 
 
-def settings_from(arguments: Arguments) -> ReportSettings:
+def report_settings_from(arguments: Arguments) -> ReportSettings:
     """Return what the options ask for; those that make no sense are refused."""
     arguments.check_least(jobs=1)
     if not (arguments.out or arguments.plan):
@@ -75,7 +75,7 @@ def settings_from(arguments: Arguments) -> ReportSettings:
     return ReportSettings(own_plans=own_plans, **given)
 
 
-def check_files(arguments: Arguments) -> None:
+def check_report_files(arguments: Arguments) -> None:
     """Refuse, before any work, what could not be written, or would replace an input."""
     own = [Path(name) for _, *names in arguments.own_plan for name in names]
     inputs = [*arguments.results, *arguments.cloud, *own]
@@ -93,9 +93,9 @@ def check_files(arguments: Arguments) -> None:
 def main(arguments: Arguments) -> int:
     """Read, draw, write; returns the exit code."""
     with checking_options():
-        settings = settings_from(arguments)
+        settings = report_settings_from(arguments)
         cloud_settings = cloud_settings_from(arguments)
-    check_files(arguments)
+    check_report_files(arguments)
     entries = collect_entries(arguments.results)
     workers = arguments.workers(arguments.jobs)
     cache = cache_from(arguments)

@@ -29,10 +29,10 @@ from ...system.errors import InputError
 from ...system.jobs.processes import OpeningError, Processes, TooSlowError, WorkerLostError
 from ..report import site
 from .access import Access
-from .asking import FORM, apply_options, are_together, make_photo, parse_options, read_form
+from .asking import FORM, apply_options, are_together, make_asked_photo, parse_options, read_form
 from .description import describe_service
-from .desk import Desk, Drawing, Limits, Sent, content_of, look_at
-from .guard import COOKIE, RETRY, SHORTAGE, Guard, refusal_of, refuse, refusing
+from .desk import Desk, Drawing, RequestLimits, Sent, content_of, look_at
+from .guard import COOKIE, RETRY, SHORTAGE, Guard, answer_refusal, refusal_of, refusing_shortage
 from .keep import Keep
 
 LOG = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ class Service:
     """Answers requests: of one event loop, while the work is done in other processes."""
 
     def __init__(
-        self, open_desk: Callable[[], Desk], limits: Limits, keep: Keep | None, access: Access
+        self, open_desk: Callable[[], Desk], limits: RequestLimits, keep: Keep | None, access: Access
     ) -> None:
         self.open_desk = open_desk
         self.limits = limits
@@ -149,14 +149,14 @@ class Service:
         """Return the name under which a photo is kept, if any is; HTTPException if there is no room."""
         if self.keep is None or result.error is not None:
             return None
-        with refusing():
+        with refusing_shortage():
             return await asyncio.to_thread(self.keep.add, task.photo.name, content_of(task), result)
 
     async def draw(self, desk: Desk, drawing: Drawing, kept: str | None) -> str:
         """Return JSON of a photo's thumbnail and pictures; keep the thumbnail of one that is kept."""
         text: str = await work(desk.processes, drawing)
         if self.keep and kept:
-            with refusing():
+            with refusing_shortage():
                 await asyncio.to_thread(self.keep.add_thumb, kept, json.loads(text)["thumb"])
         return text
 
@@ -195,7 +195,7 @@ class Service:
                 await form.close()
                 options = parse_options(text)
                 settings = self.settings_of(options)
-                photos = {name: make_photo(name, options) for name in pictures}
+                photos = {name: make_asked_photo(name, options) for name in pictures}
                 tasks = [Task(photo, settings, {name: pictures[name]}) for name, photo in photos.items()]
                 yield Sent(tasks, are_together(options))
 
@@ -329,8 +329,8 @@ def make_app(service: Service) -> Starlette:
 
     async def refuse_error(request: Request, error: Exception) -> Response:
         if isinstance(error, SHORTAGE):
-            return refuse(refusal_of(error))
-        return refuse(error if isinstance(error, HTTPException) else HTTPException(400, str(error)))
+            return answer_refusal(refusal_of(error))
+        return answer_refusal(error if isinstance(error, HTTPException) else HTTPException(400, str(error)))
 
     refused = (HTTPException, InputError, ClientDisconnect, *SHORTAGE)
 

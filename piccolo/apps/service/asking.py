@@ -84,7 +84,7 @@ def describe_unknown(name: str, known: Collection[str]) -> str:
     return f"found {printable(name)[:40]!r}, wanted {wanted}"
 
 
-def make_photo(name: str, options: Mapping[str, Any]) -> Photo:
+def make_asked_photo(name: str, options: Mapping[str, Any]) -> Photo:
     """Return the photo with the options of its part; its calibration is JSON in place of a file."""
     given = check_object(options.get("photo", {}), PHOTO, "options.photo")
     try:

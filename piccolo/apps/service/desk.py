@@ -30,7 +30,7 @@ PIXELS = 1e6  # in a megapixel
 MAP = "service.piccolo-map"
 
 
-class Limits(NamedTuple):
+class RequestLimits(NamedTuple):
     """Bounds of what a request may take."""
 
     max_bytes: int  # of its body
@@ -93,7 +93,7 @@ class Desk:
 
 
 def open_desk(
-    localizer: Localizer, num_jobs: int, limits: Limits, keeps_photos: bool, workers: Workers
+    localizer: Localizer, num_jobs: int, limits: RequestLimits, keeps_photos: bool, workers: Workers
 ) -> Desk:
     """Open a scan, with its local features, so that no photo waits for these; InputError if it can't be."""
     files = look_at(localizer.paths)
@@ -147,12 +147,12 @@ def open_answering(localizer: Localizer, max_pixels: float) -> Function:
 
     def work(item: Sent | Drawing | None) -> list[Result] | str | None:
         if isinstance(item, Drawing):
-            return draw(scan, surfels(), item)
+            return draw_photo(scan, surfels(), item)
         if item is None:
             surfels()
             return None
         for task in item.tasks:
-            check_size(task, max_pixels)
+            check_sent_size(task, max_pixels)
         if len(item.tasks) == 1:
             return [answer(item.tasks[0]).result]
         if item.are_together:
@@ -162,7 +162,7 @@ def open_answering(localizer: Localizer, max_pixels: float) -> Function:
     return work
 
 
-def check_size(task: Task, max_pixels: float) -> None:
+def check_sent_size(task: Task, max_pixels: float) -> None:
     """Refuse a picture with more pixels than a service takes, before it is decoded."""
     name = task.photo.name
     width = height = 0
@@ -178,7 +178,7 @@ def content_of(task: Task) -> bytes:
     return (task.files or {})[task.photo.name]
 
 
-def draw(scan: Scan, surfels: Any, drawing: Drawing) -> str:
+def draw_photo(scan: Scan, surfels: Any, drawing: Drawing) -> str:
     """Return JSON of a photo's thumbnail and pictures."""
     result = drawing.result
     poses = list_poses(result, scan.prepared.from_world)

@@ -95,7 +95,7 @@ class Guard:
         try:
             self.check(scope, headers)
         except HTTPException as error:
-            await refuse(error)(scope, body.receive, answer)
+            await answer_refusal(error)(scope, body.receive, answer)
             return
         await self.app(scope, body.receive, answer)
 
@@ -157,7 +157,7 @@ def refusal_of(error: Exception) -> HTTPException:
 
 
 @contextmanager
-def refusing() -> Iterator[None]:
+def refusing_shortage() -> Iterator[None]:
     """Within this, HTTPException where the system gives way."""
     try:
         yield
@@ -165,6 +165,6 @@ def refusing() -> Iterator[None]:
         raise refusal_of(error) from error
 
 
-def refuse(error: HTTPException) -> JSONResponse:
+def answer_refusal(error: HTTPException) -> JSONResponse:
     """Return the answer of a refusal: its text as JSON, in one line."""
     return JSONResponse({"error": error.detail}, error.status_code, error.headers)

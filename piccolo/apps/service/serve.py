@@ -20,7 +20,7 @@ from ...system.files.json_file import read_text
 from ...system.jobs.memory import GB, memory_taken
 from ...system.jobs.threads import num_cores
 from .access import LOOPBACK, Access
-from .desk import Limits, open_desk
+from .desk import RequestLimits, open_desk
 from .keep import open_keep
 
 EPILOG = """\
@@ -83,7 +83,7 @@ def main(arguments: Arguments) -> int:
         access = access_from(arguments)
     if a.keep and not a.keep.is_dir():
         raise InputError(f"{a.keep}: found no folder, wanted one that exists")
-    limits = Limits(
+    limits = RequestLimits(
         int(a.max_megabytes * MEGABYTE),
         a.max_megapixels * MEGABYTE,
         a.max_waiting,

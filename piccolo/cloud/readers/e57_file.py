@@ -49,7 +49,7 @@ class E57File(NamedTuple):
 @contextmanager
 def open_file(path: Path) -> Iterator[E57File]:
     """Check the header and XML of an E57 file, and yield it open for reading."""
-    root = read_xml(path)
+    root = read_e57_xml(path)
     libe57 = import_optional(path, "pye57.libe57")
     with refusing(path, libe57):
         image_file = libe57.ImageFile(str(path), "r", CHECK_ALL)
@@ -68,7 +68,7 @@ def refusing(path: Path, libe57: ModuleType) -> Iterator[None]:
         raise InputError(f"{path}: broken E57 file ({quote_line(str(error).encode())})") from error
 
 
-def read_xml(path: Path) -> Element:
+def read_e57_xml(path: Path) -> Element:
     """Return the root of a file's XML section."""
     return _parse_xml(path, read_section(path))
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...system.errors import InputError, import_optional
 from ..settings import BY_FILE, Channel, CloudSettings
 from . import reader
-from .las_file import VLR_HEADER, WANTED, LasHeader, find_units, read_header
+from .las_file import VLR_HEADER, WANTED, LasHeader, find_units, read_las_header
 from .reader import MAX_BLOCK_SIZE, POINTS_A_CHUNK, MissingChannelError, PointSource, quote_line
 
 # What is wanted of formats 6 to 10, where fields can be passed over.
@@ -39,7 +39,7 @@ def open_las(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "c
     Colours are 16-bit, as the format says, unless a million points, spread evenly over the file, tell of
     another range. If all of these points are black, the file counts as one without colours.
     """
-    header = read_header(path)
+    header = read_las_header(path)
     source = _open(header, options, channel)
     if options.scale is not None:
         return source

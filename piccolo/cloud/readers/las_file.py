@@ -71,7 +71,7 @@ class LasHeader(NamedTuple):
         return self.point_format in COLORS_BYTE
 
 
-def read_header(path: Path) -> LasHeader:
+def read_las_header(path: Path) -> LasHeader:
     """Return the header of a LAS or LAZ file; InputError if it is broken or promises too much."""
     with path.open("rb") as file:
         head = file.read(MIN_HEADER_SIZE_1_4)
@@ -125,9 +125,9 @@ def record_content(header: LasHeader, file: BinaryIO, wanted_user: bytes, wanted
     return None
 
 
-def read_crs(path: Path) -> str:
+def read_las_crs(path: Path) -> str:
     """Return the coordinate system that a file names, as WKT or EPSG:code; empty if it names none."""
-    wkt, keys, _ = _projection(read_header(path))
+    wkt, keys, _ = _projection(read_las_header(path))
     codes = {key: value for key, (place, value) in read_geo_keys(keys).items() if place == 0}
     code = codes.get(PROJECTED_KEY, codes.get(GEOGRAPHIC_KEY, 0))
     return wkt or (f"EPSG:{code}" if 0 < code < USER_DEFINED else "")

@@ -118,7 +118,7 @@ def _points(surface: Surface, k: Int64s, rows: Int64s, texels: Bytes | None) -> 
     if texels is None or surface.uv is None:
         gray = np.full(points_world.shape, GRAY, np.uint8)
         return RawCloud(points_world, gray if factors is None else to_bytes(factors, surface.is_linear))
-    found = look_up(texels, _blend(surface.uv, triangles, weights))
+    found = look_up_texels(texels, _blend(surface.uv, triangles, weights))
     colors = found[:, :3]
     is_visible = found[:, 3] > 0
     if factors is not None:
@@ -132,7 +132,7 @@ def _blend(values: Array, corners: Int64s, weights: Array) -> Array:
     return np.asarray(a + b + c)
 
 
-def look_up(texels: Bytes, uv: Array) -> Bytes:
+def look_up_texels(texels: Bytes, uv: Array) -> Bytes:
     """Return texels (N, 4) at uv (N, 2): u to the right, v upwards from the lower edge, both repeating."""
     height, width = texels.shape[:2]
     turned = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)

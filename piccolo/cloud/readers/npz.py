@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...system.errors import InputError
-from ...system.files.array_archive import MAX_HEAD_SIZE, read_header
+from ...system.files.array_archive import MAX_HEAD_SIZE, read_array_header
 from ..settings import BY_FILE, Channel, CloudSettings
 from . import reader
 from .reader import MissingChannelError, PointSource, quote_line
@@ -161,7 +161,7 @@ def _members(path: Path, is_bare: bool) -> list[zipfile.ZipInfo]:
 def _open_array(path: Path, member: str | None, size: int) -> ArrayInFile:
     """Return the array in a file or member of `size` bytes, by its header."""
     with naming_damage(path), _open(path, member) as file:
-        shape, is_fortran, dtype, offset = read_header(file.read(MAX_HEAD_SIZE))
+        shape, is_fortran, dtype, offset = read_array_header(file.read(MAX_HEAD_SIZE))
     array = ArrayInFile(path, member, shape, is_fortran, dtype, offset)
     if dtype.hasobject or dtype.itemsize == 0 or any(count < 0 for count in shape):
         raise InputError(f"{path}: {array}, {WANTED}")

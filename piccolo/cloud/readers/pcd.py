@@ -59,7 +59,7 @@ class PcdHeader(NamedTuple):
         return sum(field.size for field in self.fields)
 
 
-def read_header(path: Path) -> PcdHeader:
+def read_pcd_header(path: Path) -> PcdHeader:
     """Return the header of a PCD file; SIZE, TYPE and COUNT, if missing as in old files, are 4, F and 1."""
     with path.open("rb") as file:
         head = file.read(MAX_PCD_HEADER_SIZE)
@@ -130,7 +130,7 @@ def open_pcd(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "c
     `label` where one is asked for. The size of a binary file is compared with the header before memory is
     reserved.
     """
-    header = read_header(path)
+    header = read_pcd_header(path)
     fields = _select_fields(header, options, channel)
     found = path.stat().st_size - header.size
     promised = {"ascii": 0, "binary": header.row_size * header.num_points}.get(header.encoding, 8)

@@ -63,7 +63,7 @@ def open_ply(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "c
     Other properties and elements are left out. The file's size is compared with the header's counts before
     memory is reserved.
     """
-    header = read_header(path)
+    header = read_ply_header(path)
     num_faces = sum(count for element, count in header.pairs if element.name == "face")
     if num_faces * MOST_STRAY > header.counts[header.index]:  # no cloud with a few stray faces
         return open_ply_mesh(path, options, channel)
@@ -95,7 +95,7 @@ def read_columns(header: PlyHeader, names: Sequence[str]) -> Iterator[reader.Col
         yield list(rows.T)
 
 
-def read_header(path: Path) -> PlyHeader:
+def read_ply_header(path: Path) -> PlyHeader:
     """Return the header of a PLY file; InputError if it is broken."""
     with path.open("rb") as file:
         head = file.read(MAX_PLY_HEADER_SIZE)

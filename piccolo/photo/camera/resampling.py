@@ -31,7 +31,7 @@ MAX_REMAP_SIDE = 32_000  # [px] of what cv2.remap reads
 Pixels = tuple[Bytes, Mask]  # rgb (H, W, 3), is_valid (H, W)
 
 
-class View(NamedTuple):
+class CameraView(NamedTuple):
     """One camera with what it has taken."""
 
     mount: Mount
@@ -45,7 +45,7 @@ def sphere_width(mounts: Sequence[Mount]) -> int:
     return min(max(width, MIN_SPHERE_WIDTH), MAX_RESAMPLED_WIDTH)
 
 
-def make_sphere(views: Sequence[View], width: int) -> Pixels:
+def make_sphere(views: Sequence[CameraView], width: int) -> Pixels:
     """Return the picture of the sphere, `width` x width / 2, a multiple of MIN_SPHERE_WIDTH.
 
     Where several cameras show the same, the one is taken whose axis is nearest; how far they are from each
@@ -70,7 +70,7 @@ def make_sphere(views: Sequence[View], width: int) -> Pixels:
     return rgb, is_shown
 
 
-def shrunk(view: View, width: int = MAX_RESAMPLED_WIDTH) -> View:
+def shrunk(view: CameraView, width: int = MAX_RESAMPLED_WIDTH) -> CameraView:
     """Return the same area-averaged, if it is clearly finer at the axis than a sphere, or too large."""
     camera = view.mount.camera
     largest = MAX_REMAP_SIDE / max(camera.width, camera.height)
@@ -81,7 +81,7 @@ def shrunk(view: View, width: int = MAX_RESAMPLED_WIDTH) -> View:
     return view._replace(pixels=np.asarray(cv2.resize(view.pixels, size, interpolation=cv2.INTER_AREA)))
 
 
-def _blocks(view: View, width: int) -> list[tuple[int, int]]:
+def _blocks(view: CameraView, width: int) -> list[tuple[int, int]]:
     """Upper left corners of the sphere's blocks in which the camera may show something."""
     u = np.arange(LOOK // 2, width, LOOK) + 0.5
     v = np.arange(LOOK // 2, width // 2, LOOK) + 0.5
@@ -94,7 +94,7 @@ def _blocks(view: View, width: int) -> list[tuple[int, int]]:
     return [(int(i) * ROWS, int(j) * COLUMNS) for i, j in np.argwhere(is_met)]
 
 
-def _resample_block(view: View, width: int, top: int, left: int) -> Pixels:
+def _resample_block(view: CameraView, width: int, top: int, left: int) -> Pixels:
     """Colours and validity of a block of the sphere's pixels."""
     u = left + np.arange(0.0, COLUMNS + 1, BLOCK_CELL)
     v = top + np.arange(0.0, ROWS + 1, BLOCK_CELL)
@@ -122,7 +122,7 @@ def _interpolate_between(values: Array, count: int) -> Array:
     return np.asarray(found.reshape(-1, *values.shape[1:]))
 
 
-def _places(view: View, width: int, u: Floats, v: Floats) -> tuple[Array, Mask]:
+def _places(view: CameraView, width: int, u: Floats, v: Floats) -> tuple[Array, Mask]:
     """Pixels (h, w, 2) of the picture at columns u (w,), rows v (h,) of the sphere, and which are in it."""
     camera = view.mount.camera
     places, is_in = camera.pixels(compute_rays(u, v[:, None], width) @ view.mount.rotation.T)

@@ -13,7 +13,7 @@ from ..camera import Calibration, Mount
 from ..camera.calibration import compute_extent
 from ..camera.model import SPHERE, Camera, camera_of_fov, pinhole
 from ..camera.photo_cameras import find_calibration
-from ..camera.resampling import View, shrunk
+from ..camera.resampling import CameraView, shrunk
 from ..photo import Photo
 from .cube import face_pixels
 from .facts import read_focal_length
@@ -114,7 +114,7 @@ def _calibrate(path: Path, picture: Picture, calibration: Calibration) -> tuple[
 
 def read_views(
     path: Path, picture: Picture, mounts: tuple[Mount, ...], is_valid: Mask
-) -> tuple[list[View], tuple[str, ...]]:
+) -> tuple[list[CameraView], tuple[str, ...]]:
     """Return each camera with its part of a picture, black borders masked, and notes for the user.
 
     `is_valid` (H, W) are the pixels that count so far.
@@ -135,7 +135,7 @@ def read_views(
             own[borders] = 0
             if borders.mean() >= MIN_REPORTED_BORDER:
                 notes.append(f"masked black borders: {100 * borders.mean():.0f} % of the picture")
-        views.append(shrunk(View(mount, own)))
+        views.append(shrunk(CameraView(mount, own)))
     return views, tuple(notes)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...system.arrays import Bytes, Mask
 from ..camera import Camera, Mount
-from ..camera.resampling import View, make_sphere, shrunk, sphere_width
+from ..camera.resampling import CameraView, make_sphere, shrunk, sphere_width
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class FocalPrior:
     focal: float  # [px] across
     deviation: float  # standard deviation of its logarithm
     source: str  # the option that gives it, or EXIF
-    view: View  # the photo, what is masked in it left out
+    view: CameraView  # the photo, what is masked in it left out
     is_hidden: Mask  # (H, W) of the sphere, masked beside
     is_measured: bool = False  # by other photos of the camera
 
@@ -57,7 +57,7 @@ class Panorama:
         """Return the sphere of a picture that came as one, by the camera that shows what it shows of it."""
         mount = Mount(camera)
         pixels = np.dstack([self.rgb, self.is_valid.view(np.uint8) * np.uint8(255)])
-        rgb, is_valid = make_sphere([View(mount, pixels)], sphere_width([mount]))
+        rgb, is_valid = make_sphere([CameraView(mount, pixels)], sphere_width([mount]))
         return replace(self, rgb=rgb, is_valid=is_valid, cameras=(mount,))
 
     def shrink_picture(self, width: int) -> "Panorama":

@@ -12,7 +12,7 @@ from ...system.errors import InputError
 from ...system.jobs.memory import check_memory
 from ..camera import Calibration, Mount
 from ..camera.calibration import MAX_OFFSET
-from ..camera.resampling import View, make_sphere, sphere_width
+from ..camera.resampling import CameraView, make_sphere, sphere_width
 from ..photo import File, Photo, as_photo
 from . import gpano
 from .cameras import Cameras, cameras_of, read_views, rig_cameras
@@ -126,7 +126,7 @@ def _on_sphere(
     width = sphere_width(cameras)
     num_bytes = width * width // 2 * PICTURE_BYTES_PER_PIXEL
     check_memory(num_bytes, f"{photo.path}: the sphere of {width} x {width // 2}", "make the picture smaller")
-    views: list[View] = []
+    views: list[CameraView] = []
     notes: list[str] = []
     counts = None
     for file, picture, mounts in shots:

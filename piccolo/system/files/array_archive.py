@@ -48,7 +48,7 @@ def write_archive(file: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
                 npy.write_array(member, array, version=(1, 0), allow_pickle=False)
 
 
-def read_header(head: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
+def read_array_header(head: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
     """Shape, order (True for Fortran's) and type of an array, by the head of its file, and where it begins.
 
     ValueError for a header that NumPy would have to mend, and warn of: filters of warnings are the process's.
@@ -111,7 +111,7 @@ class ArrayArchive:
         info = self.members[name]
         begin = self._begin(info)
         head = self.content[begin : begin + min(MAX_HEAD_SIZE, info.file_size)]
-        shape, is_fortran, dtype, size = read_header(head)
+        shape, is_fortran, dtype, size = read_array_header(head)
         first = begin + size
         found = info.file_size - size
         promised = math.prod(shape) * dtype.itemsize

@@ -102,7 +102,7 @@ def _in_place_of(path: Path) -> Iterator[tuple[Path, Path]]:
     target = _target_of(path)
     temporary = target.with_name(temporary_prefix(target.name) + secrets.token_hex(8))
     try:
-        with naming(path, temporary):
+        with naming_written(path, temporary):
             yield target, temporary
             for wait in WAITS_S:
                 with suppress(PermissionError):
@@ -125,7 +125,7 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     the new one; its other hard links keep the old content. What is_stream gets the whole content at the end.
     """
     if is_stream(path):
-        with naming(path), tempfile.TemporaryFile() as file:
+        with naming_written(path), tempfile.TemporaryFile() as file:
             yield file
             file.seek(0)
             _write_stream(path, file)
@@ -165,7 +165,7 @@ def _write_stream(path: Path, file: IO[bytes]) -> None:
 
 
 @contextmanager
-def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
+def naming_written(path: Path, temporary: Path | None = None) -> Iterator[None]:
     """Within this, the system's error while `path` is written names it, and nothing temporary.
 
     That stdout's reader has gone stays an error without a name, as where `print` finds it out.
@@ -212,7 +212,7 @@ def _check_whole(made: Path) -> None:
     for path in (made, *sorted(made.rglob("*"))):
         if path.is_file():
             size = path.stat().st_size
-            with naming(path), path.open("ab") as file:
+            with naming_written(path), path.open("ab") as file:
                 file.write(bytes(ROOM))
                 file.flush()
                 file.truncate(size)
@@ -239,7 +239,7 @@ def replacing_by_library(path: Path, errors: Errors = ()) -> Iterator[Path]:
 
 def write_temporary(path: Path, content: bytes) -> None:
     """Write a file of a temporary folder, of which half is never seen; the system's error names it."""
-    with naming(path):
+    with naming_written(path):
         path.write_bytes(content)
 
 

@@ -76,7 +76,7 @@ def read_json(path: Path, wanted: str) -> Any:
 
 
 @contextmanager
-def document_of(text: str, form: str, label: str) -> Iterator[Any]:
+def reading_document(text: str, form: str, label: str) -> Iterator[Any]:
     """Yield the JSON object in `text`, which says that it is of the format `form`; `label` begins an error.
 
     Within this, what damaged fields raise is an InputError too.
@@ -106,7 +106,7 @@ def naming(path: Path, wanted: str) -> Iterator[None]:
         mark = ":" if str(error).startswith("found") else ","  # behind which the part is named
         raise InputError(f"{path}{mark} {error}; {wanted}") from error
     except DAMAGE as error:
-        raise InputError(f"{path}: found {describe(error)}, {wanted}") from error
+        raise InputError(f"{path}: found {describe_damage(error)}, {wanted}") from error
 
 
 def parse_lines(path: Path, content: bytes, parse: Callable[[str], Value]) -> list[Value]:
@@ -117,11 +117,11 @@ def parse_lines(path: Path, content: bytes, parse: Callable[[str], Value]) -> li
             if line.strip():
                 values.append(parse(line.decode()))
         except DAMAGE as error:
-            raise InputError(f"{path}, line {number}: {describe(error)}") from error
+            raise InputError(f"{path}, line {number}: {describe_damage(error)}") from error
     return values
 
 
-def describe(error: Exception) -> str:
+def describe_damage(error: Exception) -> str:
     """Return what one of DAMAGE says, in words."""
     if isinstance(error, KeyError):
         return f"no field {str(error.args[0])[:40]!r}"

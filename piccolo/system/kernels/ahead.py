@@ -33,18 +33,18 @@ HELPS = "helps"  # argument of a process that helps
 helping: list[subprocess.Popen[bytes]] = []  # kept, as its end would close what they wait on
 
 
-def describe(kind: Any) -> str:
+def describe_type(kind: Any) -> str:
     """Return a type of Numba in words that `parse` reads: float32[2C] is an array of two axes in C order."""
     if isinstance(kind, types.Array):
         return f"{kind.dtype}[{kind.ndim}{kind.layout}]"
     if isinstance(kind, TYPES.BaseTuple):
         made = getattr(kind, "instance_class", None)
         name = f"{made.__module__}.{made.__qualname__}" if made else ""
-        return f"{name}({' '.join(describe(inner) for inner in kind)})"
+        return f"{name}({' '.join(describe_type(inner) for inner in kind)})"
     return str(kind)
 
 
-def parse(text: str) -> tuple[Any, ...]:
+def parse_types(text: str) -> tuple[Any, ...]:
     """Return the types of Numba that a text describes."""
     within: list[tuple[str, list[Any]]] = [("", [])]
     for token in TOKEN.findall(text):
@@ -66,7 +66,7 @@ def list_kernels() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     for line in LISTED.read_text(encoding="utf-8").splitlines():
         if line and not line.startswith("#"):
             name, _, arguments = line.partition(" | ")
-            yield jit.KERNELS[name], parse(arguments)
+            yield jit.KERNELS[name], parse_types(arguments)
 
 
 def compile_missing(kernels: Iterable[tuple[Any, Any]]) -> None:

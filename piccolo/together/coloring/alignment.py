@@ -127,7 +127,7 @@ def align(
         read = partial(read_all, points, sightings, images, workers)
         values = read(poses, np.ones_like(gains)).values
         gains = balance(sightings.point, sightings.photo, values, len(poses))
-        poses = agree(partial(read, gains=gains), sightings, poses, anchors)
+        poses = agree_on_poses(partial(read, gains=gains), sightings, poses, anchors)
     return poses, gains
 
 
@@ -187,7 +187,7 @@ def read_all(
     return readings
 
 
-def agree(
+def agree_on_poses(
     read: Callable[[Sequence[Pose]], Readings], sightings: Sightings, poses: list[Pose], anchors: list[Anchor]
 ) -> list[Pose]:
     """Return the poses at which photos agree best, near their anchors."""

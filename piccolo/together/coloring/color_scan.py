@@ -281,8 +281,8 @@ def write_colored_scan(
     Points that no photo sees are black. Raises InputError if the scan is not of such files, if fewer than
     two photos are localized, and for an unknown suffix.
     """
-    check_files(paths)
-    check_suffix(out)
+    check_point_files(paths)
+    check_colored_suffix(out)
     brushes = make_aligned_brushes(scan_map, results, workers)
 
     def color(points_world: Array) -> Paint:
@@ -313,13 +313,13 @@ def color_if_enough(
     return Coloring(results, colored.num_points, colored.num_colored)
 
 
-def check_files(paths: Sequence[Path]) -> None:
+def check_point_files(paths: Sequence[Path]) -> None:
     """Refuse a scan that is not of files of points: a prepared map, or arrays."""
     if find_prepared_map(paths) or not all(path.exists() for path in paths):
         raise InputError(f"{paths[0]}: found no files of points, wanted those of a scan to be coloured")
 
 
-def check_suffix(out: Path) -> None:
+def check_colored_suffix(out: Path) -> None:
     """Refuse a name that does not say in which format a scan is to be written."""
     if out.suffix.lower() not in SUFFIXES:
         raise InputError(f"{out}: wanted a name that ends with {', '.join(SUFFIXES)}")

@@ -14,7 +14,7 @@ NUM_NARROW = 4  # chosen: places within reach from which a narrow photo is track
 Place = tuple[Pose, float]  # in the map, as rough as the grid of candidates; log odds against the frame's own
 
 
-class Expected(NamedTuple):
+class ExpectedFrame(NamedTuple):
     """The pose that a frame is expected to have, from the pose of another, and its limits."""
 
     last: Pose  # of the other frame, moved by the odometry if there is one
@@ -41,18 +41,18 @@ class Followed(NamedTuple):
     is_alone: bool  # False if it may be at another place within reach
 
 
-def expect(frame: Frame, near: Sequence[tuple[Frame, Pose]], motion: Motion) -> Expected:
+def expect(frame: Frame, near: Sequence[tuple[Frame, Pose]], motion: Motion) -> ExpectedFrame:
     """Predict where a frame is from others, the last of them first: by odometry or at constant velocity."""
     before, last = near[0]
     seconds = frame.time - before.time
     reach = motion.reach(seconds)
     if frame.odometry is not None and before.odometry is not None:
         moved = carry(frame.odometry, before.odometry, last)
-        return Expected(moved, reach, moved)
+        return ExpectedFrame(moved, reach, moved)
     if len(near) == 1:
-        return Expected(last, reach, last)
+        return ExpectedFrame(last, reach, last)
     earlier, pose = near[1]
-    return Expected(last, reach, predict(last, pose, seconds / (before.time - earlier.time), reach))
+    return ExpectedFrame(last, reach, predict(last, pose, seconds / (before.time - earlier.time), reach))
 
 
 def predict(last: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pose:
@@ -67,14 +67,14 @@ def predict(last: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pos
     return Pose(exp_so3(turn) @ last.R_cam_from_world, last.center_world + move)
 
 
-def list_alike(expected: Expected, places: Sequence[Place]) -> list[Pose]:
+def list_alike(expected: ExpectedFrame, places: Sequence[Place]) -> list[Pose]:
     """Return the places within reach that look hardly worse than the best one, as copies do."""
     alike = [pose for pose, behind in places if behind > -COPY_LOG_ODDS]
     return [pose for pose in alike if expected.is_within(pose)]
 
 
 def list_starts(
-    expected: Expected, behind: float, alike: Sequence[Pose], is_narrow: bool, told: Sequence[Pose] = ()
+    expected: ExpectedFrame, behind: float, alike: Sequence[Pose], is_narrow: bool, told: Sequence[Pose] = ()
 ) -> list[Start]:
     """Return from where a frame is tracked, in order, until an end holds.
 
@@ -88,14 +88,14 @@ def list_starts(
     return [*best, Start(expected.pose, True)] if is_narrow else best
 
 
-def is_acceptable(state: State, expected: Expected, must_be_sure: bool) -> bool:
+def is_acceptable(state: State, expected: ExpectedFrame, must_be_sure: bool) -> bool:
     """Return True for a pose within reach that is sure by itself or, if it need not be, was expected."""
     is_expected = not must_be_sure and ONE_PLACE.holds(state.pose, expected.pose)
     is_sure = state.log_odds >= MOST_EXPECTED or is_expected
     return is_sure and expected.is_within(state.pose)
 
 
-def describe_end(end: State, expected: Expected, alike: Sequence[Pose]) -> Followed:
+def describe_end(end: State, expected: ExpectedFrame, alike: Sequence[Pose]) -> Followed:
     """Describe how a frame was found."""
     how: How = "tracked" if ONE_PLACE.holds(end.pose, expected.pose) else "near"
     return Followed(end, how, all(ONE_PLACE.holds(pose, end.pose) for pose in alike))

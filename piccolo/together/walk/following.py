@@ -24,25 +24,25 @@ from ...localization.near import Near, refine_near
 from ...problem.problem import Problem
 from ...system.jobs.threads import Workers
 from ..beside import attach_by_matches, confirm, fuse_allowed
-from .expectation import Expected, Followed, describe_end, is_acceptable, list_alike, list_starts
+from .expectation import ExpectedFrame, Followed, describe_end, is_acceptable, list_alike, list_starts
 from .frames import MOST_EXPECTED, State, log_ratio, put_state
 from .places import list_places, log_behind, narrow_down
 
 LEAST_SCORE = 0.05  # of a tracked pose: with less it explains nothing
 
 
-class Told(NamedTuple):
+class KnownPoses(NamedTuple):
     """Poses that are known where a narrow photo is looked for."""
 
     known: Sequence[Pose] = ()  # at which it was found before
     beside: Sequence[PoseGaussian | None] = ()  # poses of the photos beside, with which it is matched
 
 
-NOTHING_TOLD = Told()
+NOTHING_TOLD = KnownPoses()
 
 
 def find_near(
-    problem: Problem, expected: Expected, means: Means, told: Told = NOTHING_TOLD
+    problem: Problem, expected: ExpectedFrame, means: Means, told: KnownPoses = NOTHING_TOLD
 ) -> Followed | None:
     """Track a frame from the expected pose, if that looks hardly worse than the best place within reach.
 

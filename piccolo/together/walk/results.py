@@ -23,7 +23,7 @@ from ...system.arrays import Array
 from ...system.jobs.threads import Progress, no_progress
 from .frames import Frame
 from .path import EVEN, Ranked
-from .second_look import finish
+from .second_look import finish_path
 from .tracker import Tracker
 
 LEAST_WALKED = 2.0  # [m] between frames by which an odometry is checked
@@ -33,7 +33,7 @@ TOLD_SCALE = 0.03  # error of an odometry's scale that is reported
 
 def make_localizations(tracker: Tracker, show: Progress = no_progress) -> list[tuple[Result, WalkFrame]]:
     """Return the result of each frame of a walk, given all frames; poses are smoothed together."""
-    path, beliefs = finish(tracker, show)
+    path, beliefs = finish_path(tracker, show)
     frames = tracker.frames
     motion = tracker.motion
     found = [make_localization(tracker, f, belief) for f, belief in zip(frames, beliefs, strict=True)]

@@ -16,7 +16,7 @@ from ...problem.accuracy import Demand
 from ...problem.problem import Problem
 from ...system.arguments import MIN_CONFIDENCE
 from ...system.jobs.threads import Progress, one_blas_thread
-from .expectation import Expected, Followed
+from .expectation import ExpectedFrame, Followed
 from .following import find_near, refine_state
 from .frames import Frame
 from .path import EVEN, Path, Ranked, believe, build_lattice
@@ -27,7 +27,7 @@ Find = Callable[[Problem], Followed | None]
 
 
 @one_blas_thread()
-def finish(tracker: Tracker, show: Progress) -> tuple[Path, list[Ranked]]:
+def finish_path(tracker: Tracker, show: Progress) -> tuple[Path, list[Ranked]]:
     """Find the path of all frames of a tracker, and what each may be.
 
     The likely places of key frames are refined, frames that were tracked elsewhere are tracked there, and
@@ -172,7 +172,7 @@ def _list_ways(tracker: Tracker, beliefs: Sequence[Ranked], k: int) -> list[tupl
     belief = beliefs[k]
     ways: list[tuple[int, Find]] = []
     if frame.key is not None and belief.expected is not None:
-        expected = Expected(belief.expected, tracker.motion.reach(0.0), belief.expected)
+        expected = ExpectedFrame(belief.expected, tracker.motion.reach(0.0), belief.expected)
         ways = [(frame.key, partial(find_near, expected=expected, means=tracker.means))]
     is_unsure = not (belief.is_enough(tracker.settings.demand) and belief.is_confirmed)
     is_kept = frame.is_key and belief.is_sure

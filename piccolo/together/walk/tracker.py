@@ -21,7 +21,7 @@ from ...scan_map.camera_positions import FreeSpace
 from ...scan_map.scan_map import ScanMap
 from ...system.jobs.threads import Stopwatch, Workers, one_blas_thread
 from .expectation import Followed, expect
-from .following import Told, find_near, refine_state
+from .following import KnownPoses, find_near, refine_state
 from .frames import REACH_SLACK, Frame, Motion, list_states, put_state
 from .path import EVEN, Lattice
 from .places import fits_mirror, list_key_states
@@ -167,7 +167,7 @@ class Tracker:
             of_others = [self._gaussian_at(k, pose) for k, _, pose in others]
         expected = expect(frame, [(self.frames[k], pose) for k, pose in near], self.motion)
         known = [state.pose for state in frame.states if expected.is_within(state.pose)]
-        return find_near(problem, expected, self.means, Told(known[:MOST_KNOWN], of_others))
+        return find_near(problem, expected, self.means, KnownPoses(known[:MOST_KNOWN], of_others))
 
     def _gaussian_at(self, k: int, pose: Pose) -> PoseGaussian | None:
         """Return a frame's pose with its covariance, if it is at a pose."""
