@@ -5,7 +5,7 @@ from ..geometry.pose import Pose
 from ..judge.pose_covariance import PoseCovariance
 from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..judge.reasons import Reason
-from ..judge.result import FAILED, FORMAT, UNREADABLE, Result
+from ..judge.result import FAILED, FORMAT, STATUSES, UNREADABLE, Result
 from ..judge.result_parts import Source
 from ..judge.result_photo import photo_of, read_as_localized
 from ..judge.sure import SHOWN, WORTH_A_LOOK
@@ -25,6 +25,7 @@ __all__ = [
     "MOST_IN_SERIES",
     "NOT_LOCALIZED",
     "SHOWN",
+    "STATUSES",
     "UNREADABLE",
     "WORTH_A_LOOK",
     "Accuracy",

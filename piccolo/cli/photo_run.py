@@ -16,11 +16,9 @@ import numpy as np
 
 from ..api.scan import Scan
 from ..api.values import (
-    AMBIGUOUS,
     FAILED,
     LOCALIZED,
-    NOT_LOCALIZED,
-    UNREADABLE,
+    STATUSES,
     Change,
     CoarseToFineSettings,
     Result,
@@ -58,7 +56,6 @@ from .options import check_arguments
 from .settings import localizer_from
 
 MAX_STEM = 255 - len(".png")  # [byte] of a file name
-STATUSES = (LOCALIZED, AMBIGUOUS, NOT_LOCALIZED, UNREADABLE, FAILED)
 NUM_MIRRORED = 2  # of the photos that were not localized
 LEFT_HANDED = (
     "the photos fit the scan mirrored, left for right: its axes are left-handed, which `up` can't mend; "
