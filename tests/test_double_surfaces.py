@@ -135,7 +135,7 @@ def test_the_map_warns_of_layers_once_and_says_where_they_are():
     points[::2] = _moved(points[::2], (0.0, 0.0, 0.009), (0.03, 0.04, 0.0))
     told = []
     cloud = rooms.stream(
-        rooms.Cloud(
+        rooms.CloudPoints(
             points.astype(np.float32), np.full(points.shape, 99, np.uint8), np.array([70.0, 7.0, 0.7])
         )
     )
@@ -189,7 +189,7 @@ def test_a_scan_whose_end_was_moved_widens_the_covariance_in_all_directions(monk
     cloud = rooms.room(1)[1]
     points = cloud.points.copy()
     points[points[:, 0] > np.quantile(points[:, 0], 0.6)] += np.float32([0.02, -0.05, 0.01])
-    moved = rooms.Cloud(points, cloud.colors, cloud.origin_world)
+    moved = rooms.CloudPoints(points, cloud.colors, cloud.origin_world)
     scan_map = prepare_map(rooms.stream(moved), WORKERS)
     assert not scan_map.layers.any()
     asked = rooms.as_panorama(taken.rgb)
