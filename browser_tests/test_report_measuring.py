@@ -11,7 +11,7 @@ import pytest
 
 from piccolo.api.result_files import read_results
 from piccolo.apps.report import report
-from piccolo.cloud.settings import BY_FILE
+from piccolo.cloud.cloud_settings import BY_FILE
 from piccolo.scan_map.open_map import open_points
 from piccolo.system.jobs.threads import Workers
 

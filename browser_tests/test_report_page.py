@@ -9,7 +9,7 @@ import pytest
 from report_scenes import HOSTILE
 
 from piccolo.api.result_files import read_results
-from piccolo.cloud.settings import BY_FILE
+from piccolo.cloud.cloud_settings import BY_FILE
 from piccolo.photo.camera.model import pinhole
 from piccolo.scan_map.open_map import open_points
 from piccolo.system.jobs.threads import Workers

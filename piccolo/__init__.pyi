@@ -21,7 +21,7 @@ from .poses.bundle_adjustment import RelativePoses as RelativePoses
 from .problem.accuracy import Accuracy as Accuracy
 from .problem.settings import CoarseToFineSettings as CoarseToFineSettings
 from .system.errors import InputError as InputError
-from .together.coloring.color_scan import Coloring as Coloring
+from .together.coloring.painting import Coloring as Coloring
 from .together.walk.frames import Motion as Motion
 
 __version__: str

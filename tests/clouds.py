@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from piccolo.cloud.cloud_settings import IN_COLORS
 from piccolo.cloud.readers.reader import PointSource, RawCloud
-from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import CloudStream, open_source
 from piccolo.geometry.pose import exp_so3
 

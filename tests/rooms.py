@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from piccolo.api.scan import Scan
-from piccolo.cloud.settings import CloudSettings
+from piccolo.cloud.cloud_settings import CloudSettings
 from piccolo.cloud.stream import CloudPoints, stream_of_arrays
 from piccolo.cloud.voxels import VoxelTable, morton_order
 from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import Pose, angle_between, yaw_rotation
-from piccolo.localization.localize import localize
 from piccolo.localization.means import Means, Trace
+from piccolo.localization.run import localize
 from piccolo.photo.panorama import Panorama
 from piccolo.problem.problem import prepare_problem
 from piccolo.problem.settings import CoarseToFineSettings

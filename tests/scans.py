@@ -6,7 +6,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 from rooms import room
 
-from piccolo.cloud.settings import BY_FILE
+from piccolo.cloud.cloud_settings import BY_FILE
 from piccolo.cloud.stream import open_cloud
 
 

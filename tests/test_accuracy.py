@@ -10,7 +10,7 @@ from results import RESULT
 
 from piccolo.cli.command import new_parser, parse
 from piccolo.cli.options import add_arguments
-from piccolo.cli.settings import settings_from
+from piccolo.cli.settings_given import settings_from
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.pose_gaussian import PoseGaussian, probability_of_ball

@@ -26,7 +26,7 @@ from piccolo.judge.candidate import Drawn
 from piccolo.judge.probability import LOCALIZED
 from piccolo.judge.selection import is_clear
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import attempts, beam, localize as method
+from piccolo.localization import attempts, beam, run as method
 from piccolo.localization.means import NO_TRACE
 from piccolo.localization.search import search_poses
 from piccolo.photo.panorama import GPano, Panorama

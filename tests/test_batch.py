@@ -16,7 +16,7 @@ from batches import PAPER, start_localize
 from piccolo.api.result_files import read_results
 from piccolo.batch import localizer as module
 from piccolo.batch.inputs import list_panoramas
-from piccolo.cli import localize, settings
+from piccolo.cli import localize, settings_given
 from piccolo.system.errors import InputError
 from research.scene import read_scene
 
@@ -246,7 +246,7 @@ class Short(module.Localizer):
 
 def test_what_the_system_did_to_a_photo_is_tried_again(scene, out, counted, monkeypatch, capsys):
     names = ["clean_0.jpg", "clean_1.jpg", "clean_2.jpg"]
-    monkeypatch.setattr(settings, "Localizer", Short)
+    monkeypatch.setattr(settings_given, "Localizer", Short)
     Short.errors.update({names[0]: MemoryError(), names[2]: OSError(errno.EIO, "Input/output error", "x")})
     assert _run(scene, out, *PAPER) == 3
     err = capsys.readouterr().err

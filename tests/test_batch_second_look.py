@@ -21,13 +21,13 @@ from poses import judged
 from results import PHONE
 
 from piccolo import open_scan
-from piccolo.api import second_look
+from piccolo.api import scan_look
 from piccolo.api.result_files import read_results
 from piccolo.api.scan import Scan
-from piccolo.api.second_look import Looking, Others
+from piccolo.api.scan_look import Looking, Others
 from piccolo.batch.localizer import Localizer
 from piccolo.cli import localize
-from piccolo.cloud.settings import CloudSettings
+from piccolo.cloud.cloud_settings import CloudSettings
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.judge.belief import make_belief
 from piccolo.judge.pose_covariance import describe_errors
@@ -269,7 +269,7 @@ def test_what_is_looked_at(scene, monkeypatch):
         asked.append([pose.key for pose in poses[:1]])
         return judged("localized", make_belief([0.93]), first.best_pose), tuple(pictures)
 
-    monkeypatch.setattr(second_look, "localize_beside", localize_beside)
+    monkeypatch.setattr(scan_look, "localize_beside", localize_beside)
 
     def look(before, pictures):
         looking = Looking(scan.prepared, scan.reader, scan.workers)
@@ -284,7 +284,7 @@ def test_what_is_looked_at(scene, monkeypatch):
     assert look(first, {}) == (first, ())
     assert len(asked) == 2
     assert look(other, {"x": None}) == (other, ())
-    monkeypatch.setattr(second_look, "has_guessed_focal", lambda picture: True)
+    monkeypatch.setattr(scan_look, "has_guessed_focal", lambda picture: True)
     assert look(first, {"x": None}) == (first, ())
     assert len(asked) == 2
 

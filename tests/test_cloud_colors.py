@@ -9,7 +9,7 @@ from plyfile import PlyData, PlyElement
 from refusals import assert_refused
 from scans import read_cloud
 
-from piccolo.cloud.settings import IN_COLORS, CloudSettings
+from piccolo.cloud.cloud_settings import IN_COLORS, CloudSettings
 from piccolo.cloud.stream import open_source, stream_of_arrays
 from piccolo.system.errors import InputError
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from clouds import whole
 
+from piccolo.cloud.cloud_settings import CloudSettings
 from piccolo.cloud.readers.text_columns import name_columns
-from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.stream import open_source
 from piccolo.system.errors import InputError
 

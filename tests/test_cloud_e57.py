@@ -10,9 +10,9 @@ from refusals import assert_refused, mutated, read_or_refused
 from scans import read_cloud
 
 from piccolo.apps import e57_images
+from piccolo.cloud.cloud_settings import IN_COLORS
 from piccolo.cloud.readers import e57_file
 from piccolo.cloud.readers.e57 import list_images, read_image
-from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import open_source
 from piccolo.geometry.pose import exp_so3, quaternion_wxyz
 from piccolo.photo.camera.photo_cameras import find_calibration

@@ -11,13 +11,13 @@ from pcd_files import content_of
 from refusals import assert_refused
 from scans import write_scalars
 
+from piccolo.cloud.cloud_settings import BY_FILE, IN_COLORS, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.readers.e57 import open_e57
 from piccolo.cloud.readers.las import open_las
 from piccolo.cloud.readers.pcd import open_pcd
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.readers.reader import MissingChannelError, RawCloud, as_gray, make_source
 from piccolo.cloud.readers.text import open_ptx, open_text
-from piccolo.cloud.settings import BY_FILE, IN_COLORS, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.stream import open_cloud, open_source
 from piccolo.geometry.pose import exp_so3
 

@@ -7,8 +7,8 @@ from clouds import read
 from las_files import RAW, las_bytes, laz_bytes
 from refusals import assert_refused
 
+from piccolo.cloud.cloud_settings import IN_COLORS
 from piccolo.cloud.readers import las
-from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import open_source
 from piccolo.system.errors import InputError
 

@@ -8,10 +8,10 @@ from refusals import assert_refused
 from scans import read_cloud
 from scipy.spatial.transform import Rotation
 
+from piccolo.cloud.cloud_settings import CloudSettings
 from piccolo.cloud.readers import mesh as mesh_module, mesh_loading
 from piccolo.cloud.readers.mesh import compute_weights, look_up_texels, open_mesh
 from piccolo.cloud.readers.ply import open_ply
-from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.stream import open_cloud
 from piccolo.geometry.colors import linear_to_srgb, srgb_to_linear
 

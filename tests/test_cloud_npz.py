@@ -8,8 +8,8 @@ from clouds import read, seeded_cloud
 from refusals import assert_refused
 from scans import read_cloud
 
+from piccolo.cloud.cloud_settings import IN_COLORS
 from piccolo.cloud.readers import npz
-from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import open_source
 from piccolo.scan_map.map_file import FORMAT, is_map_file, load_map
 

@@ -7,8 +7,8 @@ from pcd_files import COLORS, ENCODINGS, PACKED, RAW, XYZ, content_of, separate
 from refusals import assert_refused
 from scans import read_cloud
 
+from piccolo.cloud.cloud_settings import IN_COLORS
 from piccolo.cloud.readers import reader as raw
-from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import open_source
 from piccolo.system.errors import InputError
 

@@ -12,9 +12,9 @@ from plyfile import PlyData, PlyElement
 from refusals import assert_input_error, assert_refused
 from scans import read_cloud
 
+from piccolo.cloud.cloud_settings import IN_COLORS, CloudSettings
 from piccolo.cloud.readers import ply
 from piccolo.cloud.readers.ply import open_ply
-from piccolo.cloud.settings import IN_COLORS, CloudSettings
 from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.writers import coordinate_type, vertex_rows, writing_ply
 from piccolo.system.errors import InputError

@@ -15,8 +15,8 @@ from refusals import assert_input_error
 from rooms import room
 
 from piccolo.api.opening import open_files
+from piccolo.cloud.cloud_settings import METRES, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.readers.reader import PointSource, RawCloud
-from piccolo.cloud.settings import METRES, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.stream import CloudStream, open_cloud, stream_of_arrays
 from piccolo.cloud.voxels import Voxels
 from piccolo.geometry.pose import exp_so3, rotation_to_z

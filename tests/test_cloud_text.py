@@ -8,9 +8,9 @@ from refusals import assert_refused
 from scans import read_cloud
 from text_files import lines_of, write_lines
 
+from piccolo.cloud.cloud_settings import IN_COLORS
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.readers.text import open_text
-from piccolo.cloud.settings import IN_COLORS
 from piccolo.system.errors import InputError
 from piccolo.system.files.json_file import is_number
 

@@ -14,7 +14,7 @@ from pyproj.enums import WktVersion
 from refusals import assert_input_error
 from scans import read_cloud
 
-from piccolo.cloud.settings import BY_FILE, METRES, CloudSettings
+from piccolo.cloud.cloud_settings import BY_FILE, METRES, CloudSettings
 from piccolo.cloud.stream import open_cloud, open_source
 from piccolo.cloud.units import Units, units_of_geo_keys, units_of_wkt
 from piccolo.cloud.writers import describe_unit, write_colored

@@ -30,9 +30,9 @@ from piccolo.system.errors import InputError, ResourceError
 from piccolo.system.files.line_file import Journal
 from piccolo.system.jobs.memory import memory_taken
 from piccolo.system.jobs.threads import Workers
-from piccolo.together.coloring import alignment, color_scan
+from piccolo.together.coloring import alignment, painting
 from piccolo.together.coloring.alignment import Anchor, add_pairs, align, balance, look, weigh_points
-from piccolo.together.coloring.color_scan import (
+from piccolo.together.coloring.painting import (
     PAINTED,
     find_medians,
     localize_by_colors,
@@ -180,7 +180,7 @@ def _result(path, rgb, pose):
 
 
 def test_a_photo_sees_the_paint_of_others_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(color_scan, "MOST_FOLDS", 2)
+    monkeypatch.setattr(painting, "MOST_FOLDS", 2)
     poses = [rooms.query(SEED, index=k).pose for k in range(3)]
     poses.append(Pose(poses[0].R_cam_from_world, poses[0].center_world + np.array([20.0, 0.0, 0.0])))
     colors = np.uint8([[255, 0, 0], [0, 255, 0], [0, 0, 255], [20, 20, 20]])
@@ -202,7 +202,7 @@ def test_a_photo_sees_the_paint_of_others_alone(tmp_path, monkeypatch):
 
 
 def test_a_stranger_is_not_localized_by_its_own_paint(tmp_path, monkeypatch):
-    monkeypatch.setattr(color_scan, "NUM_COLORING_ROUNDS", 1)
+    monkeypatch.setattr(painting, "NUM_COLORING_ROUNDS", 1)
     scan_map = _gray_map(rooms.room(SEED, 40_000)[1])
     settings = rooms.KNOWN
     right = [rooms.query(SEED, index=k, width=WIDTH) for k in range(2)]

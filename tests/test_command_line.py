@@ -19,8 +19,8 @@ from rooms import errors, query, room
 from piccolo.cli import localize, photo_run, prepare_map, terminal
 from piccolo.cli.command import UsageError, checking_options, command, new_parser, parse
 from piccolo.cli.options import add_arguments
-from piccolo.cli.settings import cloud_settings_from
-from piccolo.cloud.settings import BY_FILE, WITHOUT_COLORS, CloudSettings
+from piccolo.cli.settings_given import cloud_settings_from
+from piccolo.cloud.cloud_settings import BY_FILE, WITHOUT_COLORS, CloudSettings
 from piccolo.doors import COMMANDS
 from piccolo.judge.result import Result
 from piccolo.system.errors import InputError, ResourceError, import_optional

@@ -10,7 +10,7 @@ from piccolo.geometry.cone import Cone
 from piccolo.geometry.pose import exp_so3, rotate_points, yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.photo.panorama.texels import find_valid, pack_texels
-from piccolo.problem.cone import CONE_MARGIN, find_cone, select_cells
+from piccolo.problem.photo_cone import CONE_MARGIN, find_cone, select_cells
 from research.synthetic.world import mask_outside_field
 
 WIDTH = 128

@@ -21,9 +21,9 @@ from piccolo.judge.candidate import Selection
 from piccolo.judge.claim import Told
 from piccolo.judge.result_parts import Alternative, Evidence, FocalLength
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import localize as module
-from piccolo.localization.calibration import follow_matches, recalibrate
-from piccolo.localization.localize import select_likeliest
+from piccolo.localization import run as module
+from piccolo.localization.claimed_geometry import follow_matches, recalibrate
+from piccolo.localization.run import select_likeliest
 from piccolo.photo.camera import Calibration, Camera, Mount
 from piccolo.photo.camera.model import pinhole
 from piccolo.photo.camera.resampling import CameraView, make_sphere

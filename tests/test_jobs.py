@@ -12,7 +12,7 @@ from batches import PAPER, start_localize, untimed, wait_for_lines, workers_of
 
 from piccolo.api.result_files import read_results
 from piccolo.batch.localizer import Localizer
-from piccolo.cli import execution, localize, settings
+from piccolo.cli import execution, localize, settings_given
 from piccolo.judge.result import Result
 from piccolo.system.jobs.memory import memory_taken
 from piccolo.system.jobs.threads import num_cores
@@ -71,7 +71,7 @@ class Deadly(Localizer):
 def test_a_photo_that_kills_its_processes_is_a_line_that_says_so(scene, tmp_path, monkeypatch, capsys):
     deadly = tmp_path / "deadly.jpg"
     deadly.write_bytes((scene / "images" / "clean_0.jpg").read_bytes())
-    monkeypatch.setattr(settings, "Localizer", Deadly)
+    monkeypatch.setattr(settings_given, "Localizer", Deadly)
     panos = tmp_path / "list.txt"
     names = [str(scene / "images" / "clean_1.jpg"), str(deadly), str(scene / "images" / "clean_2.jpg")]
     panos.write_text("\n".join(names))

@@ -220,6 +220,20 @@ def test_a_number_has_a_name_of_its_own():
     assert {name: found for name, found in users.items() if len(found) > 1} == {}
 
 
+def test_a_file_a_function_or_a_class_has_a_name_of_its_own():
+    """But for the parts of a command."""
+    users = {}
+    for module, path in MODULES.items():
+        if module.startswith("piccolo."):
+            kinds = ast.FunctionDef, ast.ClassDef
+            names = {node.name for node in ast.parse(path.read_text()).body if isinstance(node, kinds)}
+            names = {name for name in names if not name.startswith("_")} - {"main", "add_arguments"}
+            for name in names | ({path.name} - {"__init__.py"}):
+                users.setdefault(name, []).append(module)
+    assert len(users) > 1500
+    assert {name: found for name, found in users.items() if len(found) > 1} == {}
+
+
 def test_no_test_imports_another():
     """What tests share is in a module beside them."""
     for path in sorted([*(ROOT / "tests").glob("*.py"), *(ROOT / "browser_tests").glob("*.py")]):

@@ -20,7 +20,7 @@ from piccolo.geometry.pose import Pose, exp_so3, step, yaw_rotation
 from piccolo.geometry.sphere import compute_pixels, pixel_rays
 from piccolo.judge.candidate import Selection, Unoccluded
 from piccolo.judge.pose_covariance import describe_errors
-from piccolo.localization.calibration import calibrate_sphere
+from piccolo.localization.claimed_geometry import calibrate_sphere
 from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.photo.panorama import Panorama
 from piccolo.problem.method import METHOD

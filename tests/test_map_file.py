@@ -10,8 +10,8 @@ import pytest
 from refusals import assert_input_error
 from rooms import make_map, map_path, scan_map
 
+from piccolo.cloud.cloud_settings import CloudSettings
 from piccolo.cloud.octree import build_octree
-from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.voxels import LEAF_SIZE, PHASE, QUANTA_PER_METRE, VoxelTable
 from piccolo.geometry.pose import exp_so3
 from piccolo.scan_map import map_file, open_map

@@ -10,7 +10,7 @@ import pytest
 from refusals import assert_input_error, fill_disk
 from rooms import scan_map
 
-from piccolo.cloud.settings import BY_FILE
+from piccolo.cloud.cloud_settings import BY_FILE
 from piccolo.scan_map import map_file, open_map
 from piccolo.scan_map.map_file import save_map
 from piccolo.scan_map.open_map import CachePolicy

@@ -22,7 +22,7 @@ from piccolo.localization.paper import (
     paper_confidence,
     prepare_by_paper,
 )
-from piccolo.photo.panorama.model import shrink
+from piccolo.photo.panorama.panorama import shrink
 from piccolo.scan_map.camera_positions import MIN_CLEARANCE
 from piccolo.system.jobs.threads import Stopwatch, Workers
 from piccolo.views.zbuffer import is_free_space

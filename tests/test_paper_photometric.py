@@ -14,7 +14,7 @@ from piccolo.geometry.pose import Pose, exp_so3, step
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.localization.paper import localize_by_paper, prepare_by_paper
 from piccolo.localization.paper_descent import refine_by_solver
-from piccolo.photo.panorama.model import shrink
+from piccolo.photo.panorama.panorama import shrink
 from piccolo.system.errors import InputError
 from piccolo.system.jobs.threads import Stopwatch, Workers
 from piccolo.views.zbuffer import View, render_view

@@ -14,7 +14,7 @@ from piccolo.photo.panorama import Panorama
 from piccolo.system.jobs.threads import Workers
 from piccolo.together.coloring import alignment, passersby
 from piccolo.together.coloring.alignment import Sightings
-from piccolo.together.coloring.color_scan import make_brushes, paint_points
+from piccolo.together.coloring.painting import make_brushes, paint_points
 from piccolo.together.coloring.passersby import cast_votes, remove_passersby, spread_votes, without
 
 SEED = 1

@@ -15,7 +15,7 @@ from refusals import assert_input_error, assert_refused
 
 import piccolo
 from piccolo.batch.inputs import read_priors
-from piccolo.cloud.settings import CloudSettings, from_wgs84
+from piccolo.cloud.cloud_settings import CloudSettings, from_wgs84
 from piccolo.cloud.stream import read_crs
 from piccolo.photo.panorama.facts import GpsPosition, PhotoFacts, read_photo_facts
 from piccolo.photo.photo import Photo, Prior

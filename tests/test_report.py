@@ -27,7 +27,7 @@ from report_scenes import (
 
 import piccolo
 from piccolo.apps.report import report
-from piccolo.apps.report.pictures import pack_depth
+from piccolo.apps.report.drawings import pack_depth
 from piccolo.judge.belief import make_belief
 from piccolo.judge.reasons import Reason
 from piccolo.system.errors import InputError

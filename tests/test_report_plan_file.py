@@ -12,7 +12,7 @@ from refusals import assert_input_error
 from report_scenes import HOSTILE, House, lifted
 
 from piccolo.apps.report import report
-from piccolo.apps.report.pictures import PIXEL, plan_matrix, read_control_points
+from piccolo.apps.report.drawings import PIXEL, plan_matrix, read_control_points
 from piccolo.apps.report.plan_file import COLORS, DPI, color_of, segments_of
 from piccolo.system.errors import InputError
 

@@ -15,8 +15,8 @@ from piccolo.cli import localize as localize_command, prepare_map as prepare_com
 from piccolo.cloud.stream import CloudPoints
 from piccolo.cloud.voxels import LEAF_SIZE, VoxelTable, join_voxels
 from piccolo.geometry.pose import Pose
-from piccolo.localization.localize import localize
-from piccolo.localization.places import add_places
+from piccolo.localization.place_names import add_places
+from piccolo.localization.run import localize
 from piccolo.photo.photo import Prior
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.scan_map.camera_positions import MIN_CLEARANCE

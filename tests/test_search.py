@@ -14,7 +14,7 @@ from piccolo.localization import attempts, search
 from piccolo.photo.panorama import Panorama, read_panorama
 from piccolo.photo.panorama.gpano import GPano
 from piccolo.photo.panorama.local_normalization import normalize_panorama, sample_channels
-from piccolo.photo.panorama.model import resize
+from piccolo.photo.panorama.panorama import resize
 from piccolo.photo.photo import Photo, Prior
 from piccolo.problem.method import METHOD
 from piccolo.problem.photo_images import make_images

@@ -12,15 +12,15 @@ from rooms import as_panorama
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from piccolo.evidence.claimed_sphere import CLAIM, SphereFit, count_deviations
 from piccolo.evidence.self_calibration import FreeEnd, LensEstimate, displace_blocks
-from piccolo.evidence.sphere import CLAIM, SphereFit, count_deviations
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.pose_gaussian import probability_of_ball
 from piccolo.geometry.sphere import compute_pixels
 from piccolo.judge.claim import Claim, Told, marginal
 from piccolo.judge.result import Result
 from piccolo.optimize.channel_loss import ChannelProblem
-from piccolo.optimize.self_calibration import sum_free_equations
+from piccolo.optimize.corrected_equations import sum_free_equations
 from piccolo.photo.camera import Camera, Mount
 from piccolo.photo.camera.corrections import Corrections
 from piccolo.photo.camera.model import pinhole, whole_sphere

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from piccolo.api.second_look import take_surer
+from piccolo.api.scan_look import take_surer
 from piccolo.geometry.pose import Pose
 from piccolo.judge.result import Result
 from piccolo.judge.result_parts import Beside, FocalLength, Source

@@ -18,9 +18,9 @@ from scans import read_cloud
 
 import piccolo
 from piccolo.cli import localize as command_line
+from piccolo.cloud.cloud_settings import IN_COLORS, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
-from piccolo.cloud.settings import IN_COLORS, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.stream import open_cloud, stream_of_arrays
 from piccolo.cloud.surfaces import paint_shape
 from piccolo.evidence.examine import complete, examine
@@ -28,7 +28,7 @@ from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.judge.probability import log_odds
 from piccolo.judge.selection import assess_alone
-from piccolo.localization import localize as method
+from piccolo.localization import run as method
 from piccolo.localization.shape import align_lines
 from piccolo.photo.panorama import Panorama
 from piccolo.photo.panorama.edges import draw_edges, find_axes, soften

@@ -11,7 +11,7 @@ import pytest
 import rooms
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from piccolo.localization import localize as method
+from piccolo.localization import run as method
 from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.system.jobs import threads
 from piccolo.system.jobs.threads import Once, Workers, one_blas_thread

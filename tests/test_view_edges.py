@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from piccolo.geometry.sphere import make_grid
-from piccolo.views.edges import replace_by_edges
+from piccolo.views.drawn_edges import replace_by_edges
 
 RINGS = 48
 DIRECTIONS = make_grid(RINGS).directions.astype(np.float64)

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..cloud.settings import METRES, CloudSettings, UpAxis
+from ..cloud.cloud_settings import METRES, CloudSettings, UpAxis
 from ..cloud.stream import ARRAYS, CloudStream, open_cloud, stream_of_arrays
 from ..localization.paper import PaperMap, prepare_by_paper
 from ..photo.photo import File

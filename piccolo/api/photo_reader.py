@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..cloud.settings import CloudSettings, from_wgs84
+from ..cloud.cloud_settings import CloudSettings, from_wgs84
 from ..judge.result import FAILED, UNREADABLE, Result
 from ..judge.result_parts import FocalLength, Source
 from ..localization.paper import PaperSettings

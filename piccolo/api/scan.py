@@ -7,7 +7,7 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any
 
-from ..cloud.settings import CloudSettings
+from ..cloud.cloud_settings import CloudSettings
 from ..evidence.occlusion import occlusion_mask
 from ..geometry.points import PackedPoints
 from ..geometry.pose import Gravity, Pose, check_pose
@@ -27,7 +27,7 @@ from ..system.arrays import Bytes, Floats
 from ..system.errors import InputError
 from ..system.files.atomic import check_output
 from ..system.jobs.threads import Workers
-from ..together.coloring.color_scan import Coloring
+from ..together.coloring.painting import Coloring
 from ..together.second_looks import Look, localize_in_order
 from ..together.walk.frames import Motion
 from ..together.walk.tracker import Tracker
@@ -35,9 +35,9 @@ from .photo_reader import PhotoReader, Settings
 from .scan_bundle import AskedPosed, localize_posed
 from .scan_coloring import color_by
 from .scan_group import AskedTogether, localize_photos_together
+from .scan_look import Looking, Others
 from .scan_photo import Asked, localize_photo
 from .scan_walk import Walk
-from .second_look import Looking, Others
 
 OPTIONS = "prior", "gravity", "accuracy", "min_confidence"  # of photos
 ONLY_DEFAULT = ("refine_focal", "gravity_vector")  # options of photos that the preset paper does not have

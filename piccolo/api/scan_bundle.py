@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 from ..geometry.pose import Pose
 from ..judge.result import Result
-from ..localization.localize import has_guessed_focal
 from ..localization.means import NO_TRACE, Trace
-from ..localization.places import add_places
+from ..localization.place_names import add_places
+from ..localization.run import has_guessed_focal
 from ..photo.photo import Photo
 from ..poses.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
 from ..problem.settings import CoarseToFineSettings

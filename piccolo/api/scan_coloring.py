@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ..cloud.settings import CloudSettings
+from ..cloud.cloud_settings import CloudSettings
 from ..judge.result import Result
 from ..scan_map.scan_map import ScanMap
 from ..system.errors import InputError
 from ..system.files.atomic import check_output
 from ..system.files.line_file import Journal
 from ..system.jobs.threads import Workers
-from ..together.coloring.color_scan import (
+from ..together.coloring.painting import (
     LEAST_COLORING_PHOTOS,
     OF_RESULTS,
     PAINTED,

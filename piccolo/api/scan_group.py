@@ -7,7 +7,7 @@ from typing import NamedTuple
 from ..judge.result import Result
 from ..judge.result_parts import Beside
 from ..localization.means import NO_TRACE, Trace
-from ..localization.places import add_places
+from ..localization.place_names import add_places
 from ..photo.panorama import Panorama
 from ..photo.panorama.facts import PhotoFacts
 from ..photo.photo import Photo

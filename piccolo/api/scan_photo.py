@@ -6,10 +6,10 @@ from typing import NamedTuple
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result, nothing_found
 from ..judge.result_parts import FocalLength
-from ..localization.localize import has_guessed_focal, localize, localize_guessed
 from ..localization.means import NO_TRACE, Means, Trace
 from ..localization.paper import PaperMap, PaperSettings, localize_by_paper
-from ..localization.places import add_places
+from ..localization.place_names import add_places
+from ..localization.run import has_guessed_focal, localize, localize_guessed
 from ..photo.photo import Photo
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap

@@ -10,7 +10,7 @@ from .. import __version__
 from ..geometry.pose import Pose, check_pose
 from ..judge.result import Result
 from ..judge.result_parts import WalkFrame
-from ..localization.places import add_places
+from ..localization.place_names import add_places
 from ..photo.panorama import Panorama, read_panorama
 from ..photo.panorama.facts import read_photo_facts, sha256_of
 from ..photo.photo import File, Photo, as_photo

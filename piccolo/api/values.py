@@ -1,6 +1,6 @@
 """The values that a program gives and gets, which commands and applications take from here."""
 
-from ..cloud.settings import CloudSettings
+from ..cloud.cloud_settings import CloudSettings
 from ..geometry.pose import Pose
 from ..judge.pose_covariance import PoseCovariance
 from ..judge.probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED

@@ -9,10 +9,10 @@ from ..api.opening import prepare_scan
 from ..api.values import LOCALIZED, CoarseToFineSettings
 from ..cli.command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from ..cli.options import add_cloud_options
-from ..cli.settings import cloud_settings_from
+from ..cli.settings_given import cloud_settings_from
+from ..cloud.cloud_settings import CloudSettings, R_z_from_axis
 from ..cloud.gravity import MAX_LEAN, dot_products, find_up, level, wall_yaw
 from ..cloud.octree import build_octree
-from ..cloud.settings import CloudSettings, R_z_from_axis
 from ..cloud.stream import CloudStream, open_cloud
 from ..cloud.writers import describe_unit, write_transformed
 from ..geometry.pose import orthonormal, rotation_to_z, yaw_rotation

@@ -8,7 +8,7 @@ from ..api.scan_coloring import check_colored_suffix, write_colored_scan
 from ..api.values import CoarseToFineSettings
 from ..cli.command import Arguments, check_outputs, checking_options, command, option
 from ..cli.options import CACHE_TEXT, add_cloud_options
-from ..cli.settings import cache_from, cloud_settings_from
+from ..cli.settings_given import cache_from, cloud_settings_from
 
 EPILOG = """\
 examples:

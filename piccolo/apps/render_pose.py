@@ -12,7 +12,7 @@ from ..api.opening import open_points
 from ..api.result_files import read_results
 from ..cli.command import Arguments, check_distinct, check_suffix, checking_options, command, option
 from ..cli.options import add_cloud_options
-from ..cli.settings import cloud_settings_from
+from ..cli.settings_given import cloud_settings_from
 from ..geometry.points import LocalCloud
 from ..geometry.pose import CAMERA_AXES, Pose, R_cam_from_angles, check_pose, check_transform
 from ..photo.camera import Camera, Mount

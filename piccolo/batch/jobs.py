@@ -27,7 +27,7 @@ from ..system.files.line_file import Journal, keeping_steps
 from ..system.jobs.interruption import Interruption, interruptible
 from ..system.jobs.processes import InFlight, Pair
 from ..system.jobs.threads import Progress, Stopwatch
-from ..together.coloring import color_scan
+from ..together.coloring import painting
 from .localizer import Localizer, rename
 from .results_file import WAYS, Records
 
@@ -154,20 +154,20 @@ def make_coloring_job(
 ) -> Job:
     """Return the job of localizing photos in the colours of the others, by which `out` is to be coloured."""
     scan_map, _ = scan.require_default_method("colours", scan.settings)
-    color_scan.check_point_files(localizer.paths)
+    painting.check_point_files(localizer.paths)
     given = {str(path): localizer.ask(path)[0] for path in photos}
 
     def localize(shown: ScanMap, k: int) -> Result:
         answer = localizer.answer_in(replace(scan, prepared=shown))(localizer.task(photos[k]))
         write_steps(str(photos[k]), answer.steps)
-        settings = {**answer.result.settings, **color_scan.OF_RESULTS}
+        settings = {**answer.result.settings, **painting.OF_RESULTS}
         return replace(answer.result, settings=settings)
 
     def run(journal: Journal) -> list[Result]:
         steps = (f"shape: {path} {sha256_of(path, localizer.photo.instant)}" for path in photos)
-        return color_scan.localize_for_colors(scan_map, steps, localize, len(photos), scan.workers, journal)
+        return painting.localize_for_colors(scan_map, steps, localize, len(photos), scan.workers, journal)
 
-    return Job("photos", given, localizer.expect(scan_map.scan_sha256, color_scan.OF_RESULTS), run, out)
+    return Job("photos", given, localizer.expect(scan_map.scan_sha256, painting.OF_RESULTS), run, out)
 
 
 class WalkInput(NamedTuple):

@@ -13,8 +13,8 @@ from ..api.opening import open_files
 from ..api.photo_reader import Settings, settings_json, unreadable_result
 from ..api.scan import Scan
 from ..api.scan_group import AskedTogether, localize_photos_together
+from ..api.scan_look import Others
 from ..api.scan_photo import Asked
-from ..api.second_look import Others
 from ..api.values import CloudSettings, CoarseToFineSettings, Result, Source, Step, Trace
 from ..photo.camera import Calibration
 from ..photo.panorama import read_panorama

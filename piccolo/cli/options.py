@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import get_args
 
 from .. import __version__
-from ..cloud.settings import METRES, RANGES, UpAxis
+from ..cloud.cloud_settings import METRES, RANGES, UpAxis
 from ..system.arguments import EXIF, MAX_SPEED, MAX_STEP, MIN_CONFIDENCE, NAMES, ORDER, Projection
 from ..system.errors import InputError
 from .command import Arguments, option

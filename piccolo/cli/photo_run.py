@@ -53,7 +53,7 @@ from ..system.jobs.threads import Stopwatch, num_cores
 from . import execution, terminal, together
 from .command import Arguments, UsageError, check_distinct, check_suffix, checking_options
 from .options import check_arguments
-from .settings import localizer_from
+from .settings_given import localizer_from
 
 MAX_STEM = 255 - len(".png")  # [byte] of a file name
 NUM_MIRRORED = 2  # of the photos that were not localized

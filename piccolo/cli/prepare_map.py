@@ -7,7 +7,7 @@ from ..scan_map.scan_map import check_name, name_scan
 from ..system.jobs.threads import Stopwatch
 from .command import Arguments, check_outputs, checking_options, command, option
 from .options import add_cloud_options
-from .settings import cloud_settings_from
+from .settings_given import cloud_settings_from
 
 EPILOG = """\
 example:

@@ -20,9 +20,9 @@ from ..system.errors import InputError
 from ..system.files.cache import sha256_of_arrays
 from ..system.jobs.memory import check_address_space
 from ..system.jobs.threads import Progress, Workers, no_progress
+from .cloud_settings import BY_FILE, Channel, CloudSettings, UpAxis
 from .point_validator import Chunk, PointValidator, find_box
 from .readers import e57, e57_file, gltf, las, las_file, mesh, npz, pcd, ply, reader, text
-from .settings import BY_FILE, Channel, CloudSettings, UpAxis
 from .voxels import Voxels, VoxelTable, morton_order
 
 METRES_LIMIT = 2000.0  # [m], a scan wider than this along two axes is more likely in millimetres

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from ..system.errors import InputError, import_optional
-from .settings import METRES
+from .cloud_settings import METRES
 
 TOKEN = re.compile(r'"(?:[^"]|"")*"|[\w.+-]+|[\[\](),]')
 WITHIN = ("COMPD_CS", "COMPOUNDCRS", "BOUNDCRS", "SOURCECRS", "COORDINATEMETADATA")  # of other systems

@@ -15,9 +15,9 @@ from ..system.arrays import Array, Bytes, Floats, Values
 from ..system.errors import import_optional
 from ..system.files.atomic import replacing, replacing_by_library
 from ..system.jobs.memory import check_memory
+from .cloud_settings import METRES
 from .readers.ply import MAGIC, PlyHeader, place_of_vertices, read_columns, read_ply_header
 from .readers.reader import POINTS_A_CHUNK
-from .settings import METRES
 from .stream import CloudStream
 
 TYPE_NAMES = {

@@ -27,7 +27,7 @@ from ..photo.camera import Camera
 from ..photo.camera.corrections import FOCAL, LENS, Corrections
 from ..photo.camera.model import MODELS, RADIAL
 from ..photo.panorama import Panorama
-from ..photo.panorama.model import FocalPrior
+from ..photo.panorama.panorama import FocalPrior
 from ..problem.accuracy import Accuracy
 from ..problem.problem import Problem
 from ..problem.stages import Limits

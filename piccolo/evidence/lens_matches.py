@@ -10,7 +10,7 @@ from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LOOSE, add, differentiate_rays
 from ..geometry.robust import geman_mcclure
 from ..local_features.matching import Matches
-from ..optimize.self_calibration import NUM_OF_POSE
+from ..optimize.corrected_equations import NUM_OF_POSE
 from ..photo.camera import Mount
 from ..photo.camera.corrections import FOCAL, LENS, Corrections
 from ..problem.method import Method

@@ -16,11 +16,11 @@ from ..optimize.sampling_loss import sampling_loss
 from ..problem.problem import Problem
 from ..system.jobs.threads import Workers
 from ..views.zbuffer import visible_points
+from .claimed_sphere import SphereFit
 from .contradictions import contradictions
 from .covariance import estimate_pose_errors
 from .focal_length import FocalFit
 from .occlusion import compare_occlusion, measure_agreement
-from .sphere import SphereFit
 
 Fit = FocalFit | SphereFit
 

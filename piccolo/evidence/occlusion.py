@@ -19,7 +19,7 @@ from ..geometry.robust import geman_mcclure
 from ..geometry.sphere import solid_angles
 from ..photo.panorama import Panorama, local_normalization
 from ..photo.panorama.local_normalization import normalize_locally, opponent_channels
-from ..photo.panorama.model import resize, shrink
+from ..photo.panorama.panorama import resize, shrink
 from ..system.arrays import Array32, Bytes, Mask
 from ..system.kernels.jit import F0, F1, kernel
 from ..views.zbuffer import View, render_view

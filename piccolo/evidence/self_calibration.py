@@ -13,7 +13,7 @@ from ..geometry.gauss_newton import Equations, minimize
 from ..geometry.pose import Pose, step
 from ..judge.claim import Told
 from ..optimize.channel_loss import ChannelProblem
-from ..optimize.self_calibration import NUM_OF_POSE, FreeSums, sum_free_equations
+from ..optimize.corrected_equations import NUM_OF_POSE, FreeSums, sum_free_equations
 from ..photo.camera.corrections import Corrections
 from ..photo.panorama.local_normalization import LEVELS_PER_UNIT, to_levels
 from ..photo.panorama.texels import Texels

@@ -16,7 +16,7 @@ from ..judge.candidate import Candidate
 from ..optimize.channel_loss import ChannelProblem, descend_channels, score
 from ..photo.panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
 from ..photo.panorama.texels import Texels
-from ..problem.cone import find_cone, select_cells
+from ..problem.photo_cone import find_cone, select_cells
 from ..problem.problem import Problem
 from ..problem.profile import Beam
 from ..problem.settings import Effort

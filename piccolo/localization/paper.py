@@ -17,7 +17,7 @@ from ..judge.probability import LEAST_LOGIT_SCORE
 from ..judge.result import Result, nothing_found
 from ..judge.result_parts import Alternative, Evidence
 from ..photo.panorama import Panorama
-from ..photo.panorama.model import shrink
+from ..photo.panorama.panorama import shrink
 from ..photo.panorama.texels import pack_texels
 from ..scan_map.camera_positions import MIN_CLEARANCE
 from ..system.arguments import MIN_CONFIDENCE, check_confidence, check_fields

@@ -34,7 +34,7 @@ def is_tilt_known(problem: Problem) -> bool:
     return gravity == "known" or (problem.source.gpano is not None and gravity != "unknown")
 
 
-def is_explained(found: Selection, searched: Problem) -> bool:
+def is_explained_by_edges(found: Selection, searched: Problem) -> bool:
     """Return True if a pose explains a photo by its edges: one alone, unless lines lie along the walls."""
     is_alone = found.margin > searched.method.clear_margin or searched.rotations is not None
     return found.best.score > searched.profile.clear_score and is_alone

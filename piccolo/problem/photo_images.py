@@ -21,11 +21,11 @@ from ..local_features.perspective_view import (
 from ..photo.panorama import Panorama
 from ..photo.panorama.edges import soften
 from ..photo.panorama.local_normalization import normalize_panorama
-from ..photo.panorama.model import resize
+from ..photo.panorama.panorama import resize
 from ..photo.panorama.texels import Texels, find_valid, pack_texels
 from ..system.arrays import Array, Mask
 from ..system.jobs.threads import Once, Workers
-from .cone import find_cone
+from .photo_cone import find_cone
 from .profile import ImageScale, ImageScales
 from .stages import ImageName
 

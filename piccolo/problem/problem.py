@@ -12,7 +12,7 @@ from ..local_features.matching import Matches
 from ..photo.panorama import Panorama
 from ..photo.panorama.edges import draw_edges
 from ..photo.panorama.gpano import rotation_to_level
-from ..photo.panorama.model import shrink
+from ..photo.panorama.panorama import shrink
 from ..photo.panorama.texels import Texels, pack_texels
 from ..photo.photo import NOTHING_KNOWN, Prior
 from ..scan_map.scan_map import ScanMap

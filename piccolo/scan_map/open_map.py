@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..cloud.settings import BY_FILE, IN_COLORS, CloudSettings, R_z_from_axis
+from ..cloud.cloud_settings import BY_FILE, IN_COLORS, CloudSettings, R_z_from_axis
 from ..cloud.stream import open_cloud, read_crs
 from ..geometry.points import LocalCloud, pack_points
 from ..geometry.pose import rotate_points

@@ -6,10 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
+from ..cloud.cloud_settings import R_z_from_axis, UpAxis
 from ..cloud.gravity import find_up, find_yaw_of_walls
 from ..cloud.layers import NO_LAYERS, describe_layers, find_layers
 from ..cloud.octree import Octree, build_octree
-from ..cloud.settings import R_z_from_axis, UpAxis
 from ..cloud.stream import CloudStream
 from ..cloud.surfaces import displacement, paint_shape, surface_variance
 from ..geometry.points import MapFrame, PackedPoints, pack_points

@@ -13,8 +13,8 @@ from ..judge.candidate import Selection
 from ..judge.result import Result
 from ..local_features.keypoints import Keypoints
 from ..localization.judging import Found
-from ..localization.localize import prepare_search
 from ..localization.means import Means
+from ..localization.run import prepare_search
 from ..photo.panorama import Panorama
 from ..problem.problem import Problem
 from ..problem.settings import CoarseToFineSettings

@@ -26,8 +26,8 @@ from ..local_features.matching import Located, Matches
 from ..localization.attempts import add_verified
 from ..localization.judging import Found, judge
 from ..localization.last_descent import refine_best
-from ..localization.localize import fit_camera
 from ..localization.means import Means
+from ..localization.run import fit_camera
 from ..photo.panorama import Panorama
 from ..problem.method import Method
 from ..problem.prior import apply_prior

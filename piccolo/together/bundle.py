@@ -24,7 +24,7 @@ from ..judge.candidate import Selection
 from ..judge.consensus import MOST_CONFLICT
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result, nothing_found
-from ..localization.calibration import calibrate
+from ..localization.claimed_geometry import calibrate
 from ..localization.judging import Found, judge_together
 from ..localization.means import NO_TRACE, Means, Trace
 from ..photo.panorama import Panorama

@@ -12,14 +12,14 @@ from ..judge.consensus import MOST_CONFLICT, Consensus
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result, nothing_found
 from ..localization.judging import Found, judge
-from ..localization.localize import (
+from ..localization.means import NO_TRACE, Means, Trace
+from ..localization.run import (
     explain_nothing,
     find,
     find_by_edges,
     list_guessed,
     prepare_search,
 )
-from ..localization.means import NO_TRACE, Means, Trace
 from ..photo.panorama import Panorama
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap

@@ -14,7 +14,6 @@ from ..judge.reasons import MIRRORED, Reason
 from ..judge.result import Result
 from ..judge.selection import assess, rank
 from ..localization.attempts import plan_attempts
-from ..localization.localize import make_attempts
 from ..localization.means import Means
 from ..localization.run import make_attempts
 from .bundle_search import Support

@@ -13,8 +13,8 @@ from ..judge.by_others import LEAST_NONE, believe_nearby
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result
 from ..localization.judging import judge
-from ..localization.localize import find, prepare_search
 from ..localization.means import Means
+from ..localization.run import find, prepare_search
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
 from ..system.arrays import Array

@@ -10,7 +10,7 @@ from ..geometry.pose import Pose
 from ..geometry.sphere import compute_pixels
 from ..photo.camera import Camera
 from ..photo.panorama import Panorama
-from ..photo.panorama.model import resize
+from ..photo.panorama.panorama import resize
 from ..photo.panorama.picture import encode_image
 from ..system.arrays import Array, Array32, Bytes, Mask
 from ..system.jobs.threads import Workers

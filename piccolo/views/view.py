@@ -15,7 +15,7 @@ from ..geometry.sphere import BLOCK_RINGS, PI, atan2, find_cell, interpolation, 
 from ..photo.panorama.local_normalization import mean_and_inverse_std, opponent, zscore
 from ..system.arrays import Array, Array32, Floats, Int32s, Mask
 from ..system.kernels.jit import F0, F1, HALF, kernel, whole
-from .edges import replace_by_edges
+from .drawn_edges import replace_by_edges
 from .zbuffer import VISIBLE_FACTOR
 
 VIEWS_A_TASK = 64  # views that a thread makes at a time

@@ -15,17 +15,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from piccolo.cli.command import Arguments, add_command, check_folder_name, command, option
+from piccolo.cloud.cloud_settings import IN_COLORS
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.point_validator import PointValidator
 from piccolo.cloud.readers.reader import POINTS_A_CHUNK
-from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import open_cloud, open_source
 from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.evidence.occlusion import AGREEMENT_WIDTH, measure_agreement
 from piccolo.geometry.points import pack_points
 from piccolo.geometry.pose import Pose, move, transform_points
 from piccolo.photo.panorama import read_panorama
-from piccolo.photo.panorama.model import shrink
+from piccolo.photo.panorama.panorama import shrink
 from piccolo.photo.panorama.picture import encode_image
 from piccolo.system.arrays import Array
 from piccolo.system.errors import InputError, unreadable

@@ -16,7 +16,7 @@ from piccolo.api.result_files import check_scan, read_results
 from piccolo.api.scan import Scan
 from piccolo.batch.answering import Answering
 from piccolo.batch.localizer import Localizer
-from piccolo.cli import execution, options, settings as cli_settings
+from piccolo.cli import execution, options, settings_given as cli_settings
 from piccolo.cli.command import (
     EXIT_BAD_INPUT,
     Arguments,

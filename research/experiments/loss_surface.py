@@ -20,12 +20,12 @@ from piccolo import InputError, Pose
 from piccolo.api.result_files import read_results
 from piccolo.cli.command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from piccolo.cli.options import add_cloud_options
-from piccolo.cli.settings import cloud_settings_from
+from piccolo.cli.settings_given import cloud_settings_from
 from piccolo.geometry.points import LocalCloud, PackedPoints
 from piccolo.geometry.pose import uniform_rotations, uniform_yaws
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.photo.panorama import read_panorama
-from piccolo.photo.panorama.model import shrink
+from piccolo.photo.panorama.panorama import shrink
 from piccolo.photo.panorama.texels import Texels, pack_texels
 from piccolo.scan_map.open_map import open_points
 from piccolo.system.arrays import Array, Int64s, Mask

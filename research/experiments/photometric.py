@@ -18,7 +18,7 @@ from piccolo.geometry.points import PackedPoints
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.localization.paper_descent import Equations, Loss
 from piccolo.photo.panorama import Panorama
-from piccolo.photo.panorama.model import shrink
+from piccolo.photo.panorama.panorama import shrink
 from piccolo.system.arrays import Array, Array32, Mask
 from piccolo.views.zbuffer import MAX_VIEW_WIDTH, MIN_VIEW_WIDTH, View, render_view
 

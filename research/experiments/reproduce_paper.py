@@ -29,7 +29,7 @@ from piccolo.cli.command import (
 )
 from piccolo.cli.execution import check_execution
 from piccolo.cli.options import add_execution_options
-from piccolo.cloud.settings import BY_FILE, IN_COLORS
+from piccolo.cloud.cloud_settings import BY_FILE, IN_COLORS
 from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.geometry.pose import Pose, move, rotation_from_quaternion_wxyz, transform_points

@@ -14,8 +14,8 @@ from piccolo.cli.command import Arguments, option
 from piccolo.cloud.stream import open_cloud, stream_of_arrays
 from piccolo.geometry.pose import Pose
 from piccolo.judge.result import Result
-from piccolo.localization.localize import localize
 from piccolo.localization.means import Means
+from piccolo.localization.run import localize
 from piccolo.photo.panorama import read_panorama
 from piccolo.problem.accuracy import PAPER_ACCURACY, Accuracy
 from piccolo.problem.method import METHOD, Method

@@ -11,8 +11,8 @@ from piccolo.cli.command import Arguments, option
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.geometry.pose import Pose
 from piccolo.judge.result import Result
-from piccolo.localization.localize import localize
 from piccolo.localization.means import Means
+from piccolo.localization.run import localize
 from piccolo.photo.camera.model import camera_of_fov
 from piccolo.photo.panorama import read_panorama
 from piccolo.scan_map.scan_map import ScanMap, prepare_map

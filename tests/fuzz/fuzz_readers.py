@@ -13,7 +13,7 @@ import atheris
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from piccolo.batch.inputs import read_priors
-from piccolo.cloud.settings import BY_FILE
+from piccolo.cloud.cloud_settings import BY_FILE
 from piccolo.cloud.stream import FORMATS
 from piccolo.judge.result import Result
 from piccolo.photo.camera.calibration import read_cameras, read_rig

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ...api.values import Result
-from ...cloud.settings import check_crs
+from ...cloud.cloud_settings import check_crs
 from ...geometry.pose import CAMERA_AXES, Pose, heading_pitch_roll_deg, quaternion_wxyz, turn_axes
 from ...photo.panorama.gpano import with_pose
 from ...photo.panorama.picture import WANTED

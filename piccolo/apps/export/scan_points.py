@@ -9,7 +9,7 @@ from msgspec import convert
 
 from ...api.opening import find_prepared_map, open_points
 from ...api.values import Result
-from ...cloud.settings import CloudSettings
+from ...cloud.cloud_settings import CloudSettings
 from ...cloud.stream import open_cloud
 from ...geometry.colors import unpack_rgb
 from ...geometry.points import LocalCloud, pack_points

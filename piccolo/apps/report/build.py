@@ -26,8 +26,8 @@ from ...system.files.cache import digest_of_sources
 from ...system.jobs.threads import Workers
 from ...views.surfels import MAX_SURFELS, Surfels, make_surfels
 from . import site
+from .drawings import PlanImage, draw_plan, extract_frames, make_pictures, own_plan
 from .photo_folder import PhotoFolder
-from .pictures import PlanImage, draw_plan, extract_frames, make_pictures, own_plan
 
 FORMAT = "piccolo-report/1"
 WIDTH = 2048  # [px] of spheres

@@ -9,7 +9,7 @@ from pathlib import Path
 from ...api.values import Result, photo_of
 from ...photo.panorama.facts import sha256_of
 from ...system.errors import InputError
-from .pictures import FRAME
+from .drawings import FRAME
 
 
 @dataclass(frozen=True)

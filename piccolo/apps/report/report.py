@@ -15,7 +15,7 @@ from ...cli.command import (
     option,
 )
 from ...cli.options import CACHE_TEXT, add_cloud_options
-from ...cli.settings import cache_from, cloud_settings_from
+from ...cli.settings_given import cache_from, cloud_settings_from
 from ...scan_map.open_map import open_map
 from ...system.errors import InputError, import_optional
 from ...system.files.atomic import check_output

@@ -24,7 +24,7 @@ from ...system.jobs.processes import Function, Processes
 from ...system.jobs.threads import Workers
 from ..report import site
 from ..report.build import WIDTH, document_of_scan, draw_surfels, list_poses
-from ..report.pictures import make_pictures
+from ..report.drawings import make_pictures
 
 PIXELS = 1e6  # in a megapixel
 MAP = "service.piccolo-map"

@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 from ...cli.command import Arguments, UsageError, checking_options, command, option
 from ...cli.options import CACHE_TEXT, add_cloud_options, add_method_options
-from ...cli.settings import localizer_from
+from ...cli.settings_given import localizer_from
 from ...system.errors import InputError, import_optional, printable
 from ...system.files.atomic import temporary_folder
 from ...system.files.json_file import read_text

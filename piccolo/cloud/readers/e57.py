@@ -15,7 +15,7 @@ import numpy as np
 from ...geometry.pose import Pose, rotate_points
 from ...system.arrays import Array, Bytes
 from ...system.errors import InputError
-from ..settings import BY_FILE, RANGES, Channel, CloudSettings
+from ..cloud_settings import BY_FILE, RANGES, Channel, CloudSettings
 from ..units import describe_foreign, units_of_wkt
 from . import e57_file, reader
 from .e57_file import E57File, open_file, parse_integer, read_number, refusing

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...system.errors import InputError, import_optional
-from ..settings import BY_FILE, Channel, CloudSettings
+from ..cloud_settings import BY_FILE, Channel, CloudSettings
 from . import reader
 from .las_file import VLR_HEADER, WANTED, LasHeader, find_units, read_las_header
 from .reader import MAX_BLOCK_SIZE, POINTS_A_CHUNK, MissingChannelError, PointSource, quote_line

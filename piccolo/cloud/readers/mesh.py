@@ -21,7 +21,7 @@ from ...geometry.colors import srgb_to_linear, to_bytes
 from ...geometry.pose import transform_points
 from ...system.arrays import Array, Bytes, Int64s, Mask
 from ...system.errors import InputError
-from ..settings import BY_FILE, Channel, CloudSettings, UpAxis
+from ..cloud_settings import BY_FILE, Channel, CloudSettings, UpAxis
 from .gltf import GLB_MAGIC
 from .mesh_loading import WANTED, Loaded, Texture, load_gltf, load_obj, load_ply
 from .reader import (

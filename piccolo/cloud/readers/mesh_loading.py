@@ -16,7 +16,7 @@ from PIL import Image
 
 from ...system.arrays import Array, Bytes
 from ...system.errors import InputError, import_optional
-from ..settings import BY_FILE, CloudSettings
+from ..cloud_settings import BY_FILE, CloudSettings
 from .gltf import GLB_MAGIC, NO_MATERIAL, Material, prepare_gltf
 
 WANTED = "wanted a mesh with textures, vertex colours or materials"

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...system.errors import InputError
 from ...system.files.array_archive import MAX_HEAD_SIZE, read_array_header
-from ..settings import BY_FILE, Channel, CloudSettings
+from ..cloud_settings import BY_FILE, Channel, CloudSettings
 from . import reader
 from .reader import MissingChannelError, PointSource, quote_line
 from .text_columns import MAX_COLUMNS, drop_broken, name_columns, names_of_user, note_names

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...system.errors import InputError, import_optional
-from ..settings import BY_FILE, Channel, CloudSettings
+from ..cloud_settings import BY_FILE, Channel, CloudSettings
 from . import reader
 from .reader import MissingChannelError, PointSource, quote_line
 from .text import LineLayout, NumberLines

@@ -17,7 +17,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ...system.errors import InputError
-from ..settings import BY_FILE, Channel, CloudSettings
+from ..cloud_settings import BY_FILE, Channel, CloudSettings
 from . import reader
 from .mesh import open_ply_mesh
 from .reader import MissingChannelError, PointSource, quote_line

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ...system.arrays import Array, Bytes, Floats, Mask
 from ...system.errors import InputError
-from ..settings import BY_FILE, RANGES, Channel, CloudSettings, UpAxis
+from ..cloud_settings import BY_FILE, RANGES, Channel, CloudSettings, UpAxis
 
 HEAD_SIZE = 512  # [byte] from which a format is known
 POINTS_A_CHUNK = 1 << 17  # points of a chunk, at most: they stay in the processor's cache

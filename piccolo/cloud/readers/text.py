@@ -20,7 +20,7 @@ from ...geometry.pose import transform_points
 from ...system.arrays import Array
 from ...system.errors import InputError
 from ...system.files.json_file import is_number
-from ..settings import BY_FILE, Channel, CloudSettings
+from ..cloud_settings import BY_FILE, Channel, CloudSettings
 from . import reader, text_columns
 from .reader import MissingChannelError, PointSource, find_brightest, quote_line
 from .text_columns import COMMENT_MARKS, Spelling, split, text_blocks

@@ -12,7 +12,7 @@ import numpy as np
 from ...system.arrays import Array
 from ...system.errors import InputError
 from ...system.files.json_file import is_number
-from ..settings import COLUMNS, CloudSettings
+from ..cloud_settings import COLUMNS, CloudSettings
 from .reader import COLOR_NAMES, CUT, NUM_COLORED, POINT_NAMES
 
 COMMENT_MARKS = (b"#", b"//")

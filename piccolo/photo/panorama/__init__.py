@@ -1,6 +1,6 @@
 """Panoramas read from files of any format and shape, always as full spheres; masks and sizes."""
 
-from .model import GPano, Panorama
+from .panorama import GPano, Panorama
 from .read import panorama_size, read_panorama
 
 __all__ = ["GPano", "Panorama", "panorama_size", "read_panorama"]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...geometry.colors import colors_of_edges
 from ...geometry.sphere import make_grid, pixel_rays
 from ...system.arrays import Array, Array32, Mask
-from .model import Panorama, resize
+from .panorama import Panorama, resize
 
 GRADIENT_WIDTH = 1024  # [px] of the sphere on which gradients are taken
 DARK = 12.0  # [levels] added before the logarithm

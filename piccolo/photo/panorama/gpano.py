@@ -21,7 +21,7 @@ import numpy as np
 from ...geometry.pose import DECIMALS, R_cam_from_angles
 from ...system.arrays import Array, Bytes, Mask
 from ...system.errors import InputError
-from .model import GPano
+from .panorama import GPano
 from .picture import MAX_PICTURE_WIDTH, SPHERE_NAMESPACE as NAMESPACE, open_picture
 
 PREFIX = re.compile(rb"xmlns:([A-Za-z_][\w.-]{0,40})\s{0,9}=\s{0,9}[\"']" + re.escape(NAMESPACE))

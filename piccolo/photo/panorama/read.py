@@ -20,7 +20,7 @@ from .cube import cube_of_cells, face_paths, read_cube_folder
 from .facts import elevation_deg
 from .gpano import ASPECT_TOLERANCE, CropRegion
 from .masks import black_borders, find_mask, is_dual_fisheye, mask_pole, polar_disc, read_mask, shows_twice
-from .model import FocalPrior, GPano, Panorama
+from .panorama import FocalPrior, GPano, Panorama
 from .picture import PICTURE_BYTES_PER_PIXEL, Picture, picture_shape, read_picture
 
 Shot = tuple[Path, Picture, tuple[Mount, ...]]  # a file with the cameras that took it

@@ -20,7 +20,7 @@ from ...geometry.pose import Pose, step, step_between
 from ...geometry.robust import geman_mcclure, inline_geman_mcclure
 from ...geometry.sphere import direction_to_pixel, pixel_jacobian, pixel_rays
 from ...photo.panorama import Panorama, texels
-from ...photo.panorama.model import resize
+from ...photo.panorama.panorama import resize
 from ...system.arrays import Array, Array32, Int32s, Int64s
 from ...system.jobs.threads import Workers
 from ...system.kernels.jit import F0, Scalar, kernel, whole

@@ -10,10 +10,10 @@ from ...geometry.nearness import ONE_PLACE, RIGHT
 from ...geometry.pose import Pose
 from ...geometry.pose_gaussian import PoseGaussian
 from ...localization.attempts import can_look_first
-from ...localization.localize import localize
 from ...localization.means import Means
+from ...localization.run import localize
 from ...photo.panorama import Panorama
-from ...problem.cone import find_cone
+from ...problem.photo_cone import find_cone
 from ...problem.prior import apply_prior
 from ...problem.problem import Problem, prepare_problem
 from ...problem.settings import CoarseToFineSettings

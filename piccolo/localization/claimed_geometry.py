@@ -7,11 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from ..evidence.examine import examine_each
-from ..evidence.focal_length import FOCAL_WIDTHS, FocalFit, fit_focal, list_matches
-from ..evidence.lens_matches import fit_matches
-from ..evidence.self_calibration import descend_freely, estimate_corrections
-from ..evidence.sphere import (
+from ..evidence.claimed_sphere import (
     CLAIM,
     NO_CORRECTION,
     SPHERE_CURVATURE,
@@ -20,6 +16,10 @@ from ..evidence.sphere import (
     make_freedom,
     search_geometry,
 )
+from ..evidence.examine import examine_each
+from ..evidence.focal_length import FOCAL_WIDTHS, FocalFit, fit_focal, list_matches
+from ..evidence.lens_matches import fit_matches
+from ..evidence.self_calibration import descend_freely, estimate_corrections
 from ..geometry.pose import Pose, rotate_points
 from ..geometry.pose_gaussian import add
 from ..judge.candidate import Selection

@@ -28,7 +28,7 @@ from ...geometry.points import PackedPoints
 from ...geometry.pose import Pose, yaw_rotation
 from ...photo.camera.model import pinhole
 from ...photo.panorama import Panorama, read_panorama
-from ...photo.panorama.model import shrink
+from ...photo.panorama.panorama import shrink
 from ...photo.panorama.picture import encode_image, read_picture
 from ...photo.panorama.video import frames_at
 from ...scan_map.scan_map import ScanMap

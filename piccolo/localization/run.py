@@ -25,11 +25,11 @@ from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
 from ..system.jobs.threads import Stopwatch, one_blas_thread
 from .attempts import Attempt, plan_attempts, search_beyond_prior
-from .calibration import calibrate, calibrate_sphere
+from .claimed_geometry import calibrate, calibrate_sphere
 from .judging import Found, judge
 from .last_descent import refine_best
 from .means import Means, Step, describe_candidates, describe_selection
-from .shape import align_level, find_tilts, is_explained, is_tilt_known
+from .shape import align_level, find_tilts, is_explained_by_edges, is_tilt_known
 
 # added to the log of the focal length: one comes near enough to any that is 20 % off
 GUESSES = (0.0, -0.15, 0.15)
@@ -123,12 +123,12 @@ def find_by_edges(problem: Problem, scan_map: ScanMap, means: Means) -> Found:
     yaw_of_walls = scan_map.yaw_of_walls
     level = align_level(problem, axes, yaw_of_walls)
     found = [find(level, scan_map, means)]  # most cameras are about level
-    if not is_tilt_known(problem) and not is_explained(found[0].selection, level):
+    if not is_tilt_known(problem) and not is_explained_by_edges(found[0].selection, level):
         with means.watch.stage("search"):
             tilts = find_tilts(problem, axes, yaw_of_walls, means.effort, means.workers)
         found += [find(tilt, scan_map, means) for tilt in tilts]
     best = max(found, key=lambda one: one.selection.best.score)
-    if level.rotations is None or is_explained(best.selection, level):
+    if level.rotations is None or is_explained_by_edges(best.selection, level):
         return best
     in_any_heading = find(replace(level, rotations=None), scan_map, means)
     return max([best, in_any_heading], key=lambda one: one.selection.best.score)

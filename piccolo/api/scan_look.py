@@ -8,8 +8,8 @@ from typing import Protocol
 from ..geometry.nearness import CONFIRMED
 from ..judge.result import Result
 from ..judge.result_parts import Beside, FocalLength
-from ..localization.localize import has_guessed_focal
-from ..localization.places import add_places
+from ..localization.place_names import add_places
+from ..localization.run import has_guessed_focal
 from ..photo.panorama import Panorama
 from ..photo.panorama.facts import PhotoFacts
 from ..photo.photo import Photo

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...cloud.cloud_settings import CloudSettings
 from ...cloud.octree import Octree, recolor
-from ...cloud.settings import CloudSettings
 from ...cloud.stream import open_cloud
 from ...cloud.writers import SUFFIXES, describe_unit, write_colored
 from ...geometry.pose import Pose
@@ -20,7 +20,7 @@ from ...geometry.pose_gaussian import turn_positions
 from ...judge.result import FAILED, Result
 from ...judge.result_photo import read_as_localized
 from ...photo.panorama import Panorama, texels
-from ...photo.panorama.model import shrink
+from ...photo.panorama.panorama import shrink
 from ...scan_map.open_map import find_prepared_map
 from ...scan_map.scan_map import SHAPE_ALONE, ScanMap, change_colors
 from ...system.arrays import Array, Array32, Bytes, Int32s

@@ -9,7 +9,7 @@ from ..api.photo_reader import Settings
 from ..api.scan import ONLY_DEFAULT
 from ..api.values import Accuracy, CoarseToFineSettings, PaperSettings
 from ..batch.localizer import Localizer
-from ..cloud.settings import CloudSettings
+from ..cloud.cloud_settings import CloudSettings
 from ..photo.photo import NOTHING_KNOWN, Photo, Prior
 from ..scan_map.open_map import CachePolicy
 from ..system.errors import InputError
