@@ -1,134 +1,60 @@
 """The structure of the packages, read from their sources."""
 
 import ast
-import functools
 import re
 from graphlib import CycleError, TopologicalSorter
-from pathlib import Path
 
 import pytest
+from house import (
+    BESIDE,
+    MODULES,
+    PAGE,
+    ROOT,
+    list_arrows,
+    list_imported,
+    list_imports,
+    list_nodes,
+    replace_drawing,
+    room_of,
+    storey_of,
+)
 
 from piccolo.apps.report import build
 from piccolo.scan_map import open_map
 
-ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("piccolo", "research")
-
-# The highest first. A room is a folder of `piccolo` or of its `apps`, or a module beside such folders. It
-# imports from rooms of lower storeys; from one of its own storey only if BESIDE says why.
-STOREYS = {
-    "doors": ["__main__", "doors"],
-    "apps": ["apps"],
-    "what programs and commands call": ["cli", "batch", "api"],
-    "photos that help each other": ["together"],
-    "method": ["localization", "evidence", "judge", "problem"],
-    "scan and photos": ["scan_map", "local_features", "optimize", "views", "poses", "photo", "cloud"],
-    "ground": ["geometry", "system"],
-}
-BESIDE = """
-apps.service -> apps.report: the page that it serves is a report
-apps.models -> apps.export: models are read and written as exports are
-cli -> batch: its command localizes batches
-cli -> api: commands call what programs call
-batch -> api: its jobs call what programs call
-localization -> evidence: what is found is examined
-localization -> judge: the search stops when a candidate is sure
-localization -> problem: it solves one
-evidence -> judge: it is gathered in a candidate, which the judge defines
-evidence -> problem: it compares the photo and the map of a problem
-judge -> problem: results repeat what was asked
-scan_map -> views: a map holds views of its scan
-scan_map -> local_features: and keypoints in them
-scan_map -> cloud: it is made of points
-optimize -> photo: its losses compare a photo with points
-poses -> photo: models of structure from motion hold cameras and poses
-poses -> cloud: and E57 files points and poses
-views -> photo: they are normalised as photos are
-views -> cloud: they are drawn of points
-geometry -> system: types of arrays, flags of kernels
-"""
 RESEARCH = ["measuring", "experiments", "evaluation", "datasets", "synthetic", "scene"]  # the highest first
 MOST_OF_CLI = 12  # rooms that it imports
 # Besides those of `piccolo`, each a room; the scripts import `piccolo.cli.start` alone, the page no Python.
 OTHER_ROOMS = {"localize.py": {"cli"}, "tools": {"cli"}, "page": set()}
 
 
-def _module(path):
-    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
-
-
-MODULES = {_module(path): path for name in PACKAGES for path in sorted((ROOT / name).rglob("*.py"))}
-
-
-@functools.cache
-def _nodes(path):
-    """All nodes of a source's syntax."""
-    return list(ast.walk(ast.parse(path.read_text())))
-
-
-def _room(module):
-    """The room of a module of `piccolo`."""
-    parts = module.split(".")[1:]
-    return ".".join(parts[: 2 if parts[0] == "apps" else 1])
-
-
-def _storey(room):
-    """The number of a room's storey, from 0 for the highest."""
-    return next(k for k, rooms in enumerate(STOREYS.values()) if room.split(".")[0] in rooms)
-
-
-def _imported(module):
-    """The modules that one imports, of these packages and others."""
-    path = MODULES[module]
-    base = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]
-    for node in _nodes(path):
-        if isinstance(node, ast.ImportFrom):
-            above = base[: len(base) - node.level + 1] if node.level else []
-            parent = ".".join([*above, *filter(None, [node.module])])
-            for alias in node.names:
-                name = f"{parent}.{alias.name}"
-                yield name if name in MODULES else parent
-        elif isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-
-
-def _graph():
-    """The modules that each module imports, but for the package's own `__init__`."""
-    modules = set(MODULES) - {"piccolo"}
-    return {module: set(_imported(module)) & modules for module in modules}
-
-
-def _arrows():
-    """From which rooms to which others modules of `piccolo` import, with the names of these modules."""
-    arrows = {}
-    for module, imported in _graph().items():
-        for other in imported if module.startswith("piccolo.") else ():
-            arrows.setdefault((_room(module), _room(other)), set()).add(f"{module} imports {other}")
-    return {ends: imports for ends, imports in arrows.items() if ends[0] != ends[1]}
-
-
 def test_rooms_import_from_lower_storeys():
     reasons = dict(line.split(": ") for line in BESIDE.strip().splitlines())
-    arrows = _arrows()
+    arrows = list_arrows()
     for (room, other), imports in arrows.items():
-        assert _storey(room) <= _storey(other), imports
-        assert _storey(room) < _storey(other) or f"{room} -> {other}" in reasons, imports
+        assert storey_of(room) <= storey_of(other), imports
+        assert storey_of(room) < storey_of(other) or f"{room} -> {other}" in reasons, imports
     assert [line for line in reasons if tuple(line.split(" -> ")) not in arrows] == []
+
+
+def test_the_drawing_in_the_documents_is_of_this_tree():
+    page = PAGE.read_text()
+    assert page == replace_drawing(page), "run python tests/house.py"
 
 
 def test_rooms_know_at_most_a_third_of_the_others():
     """Of all pairs of rooms in the checkout, of which one can import the other."""
-    arrows = set(_arrows()) | {(room, other) for room, others in OTHER_ROOMS.items() for other in others}
-    graph = {module: other for module, other in _graph().items() if module.startswith("research.")}
+    arrows = set(list_arrows()) | {(room, other) for room, others in OTHER_ROOMS.items() for other in others}
+    graph = {module: other for module, other in list_imports().items() if module.startswith("research.")}
     imported = {name for others in graph.values() for name in others if name.startswith("piccolo.")}
-    arrows |= {("research", _room(name)) for name in imported}
-    inside = {_room(module) for module in MODULES if module.startswith("piccolo.")} - {"apps"}
+    arrows |= {("research", room_of(name)) for name in imported}
+    inside = {room_of(module) for module in MODULES if module.startswith("piccolo.")} - {"apps"}
     num = len({*inside, *OTHER_ROOMS, "research"})
     assert len(arrows) <= num * (num - 1) / 2 / 3
 
 
 def test_research_imports_downwards():
-    for module, imported in _graph().items():
+    for module, imported in list_imports().items():
         for other in imported:
             if module.startswith("research.") and other.startswith("research."):
                 above, below = (RESEARCH.index(name.split(".")[1]) for name in (module, other))
@@ -136,20 +62,20 @@ def test_research_imports_downwards():
 
 
 def test_the_command_line_leans_on_few_rooms():
-    assert len({other for room, other in _arrows() if room == "cli"}) <= MOST_OF_CLI
+    assert len({other for room, other in list_arrows() if room == "cli"}) <= MOST_OF_CLI
 
 
 def test_product_and_research_import_no_scripts_and_the_product_no_research():
     scripts = {path.stem for path in (ROOT / "tools").glob("*.py")} | {"tools", "examples", "tests"}
     for module in MODULES:
-        tops = {name.split(".")[0] for name in _imported(module)}
+        tops = {name.split(".")[0] for name in list_imported(module)}
         assert not tops & scripts, module
         assert module.startswith("research.") or "research" not in tops, module
 
 
 def test_no_modules_import_each_other():
     try:
-        TopologicalSorter(_graph()).prepare()
+        TopologicalSorter(list_imports()).prepare()
     except CycleError as error:
         pytest.fail(" -> ".join(error.args[1]))
 
@@ -168,7 +94,7 @@ def test_every_folder_is_a_package():
 
 def test_only_commands_know_argparse():
     for module, path in MODULES.items():
-        imports = [n for n in _nodes(path) if isinstance(n, ast.Import)]
+        imports = [n for n in list_nodes(path) if isinstance(n, ast.Import)]
         imports = {a.name for n in imports for a in n.names}
         assert "argparse" not in imports or module.startswith(("piccolo.cli.", "research.")), module
 
@@ -178,7 +104,7 @@ def test_one_module_makes_statuses():
     calls = [
         (str(path.relative_to(ROOT / "piccolo")), node)
         for path in (ROOT / "piccolo").rglob("*.py")
-        for node in _nodes(path)
+        for node in list_nodes(path)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
     ]
 

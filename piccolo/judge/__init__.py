@@ -4,7 +4,7 @@ Whatever helps a photo changes its `Belief` in one respect, or gives a pose with
 - `localization.judging`: evidence of the photo alone gives `place`, its errors `within`, its camera `doubt`;
 - `together.bundle`, `together.group`: `believe_together`, by photos whose relative poses are known or found;
 - `together.beside`: `believe_beside`, by a photo that shows the same;
-- `localization.localize`: `share_place` among results with several focal lengths;
+- `localization.run`: `share_place` among results with several focal lengths;
 - `judge.conclude`: `follow_consensus`, `doubt` by all photos of a camera (asked by `together.second_looks`);
 - `together.walk`: `place`, by the path of the camera.
 A new way adds its function to `judge.by_others`, and a job that calls it.
