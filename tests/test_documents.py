@@ -3,7 +3,6 @@
 import csv
 import doctest
 import hashlib
-import itertools
 import json
 import re
 import runpy
@@ -233,11 +232,14 @@ def test_docstrings(name, folder, monkeypatch):
 
 
 @pytest.mark.parametrize(("kind", "own"), [(Cloud, {"source"}), (Photo, {"picture"}), (Prior, set())])
-def test_the_tables_of_options_name_all(kind, own):
+def test_the_options_are_named_and_explained(kind, own):
+    names = {field.name for field in fields(kind)}
     page = (ROOT / "docs/API.md").read_text()
-    table = page.partition(f"| option of `{kind.__name__}`")[2].partition("\n\n")[0]
-    named = [re.findall(r"`([a-z_]+)`", line.split("|")[1]) for line in table.splitlines()[2:]]
-    assert sorted(itertools.chain(*named)) == sorted({f.name for f in fields(kind)} - own)
+    told = re.split(r"\n\n|`help", page.partition(f"`help(piccolo.{kind.__name__})`")[2], maxsplit=1)[0]
+    assert sorted(re.findall(r"`([a-z_]+)`", told)) == sorted(names - own)
+    explained = kind.__doc__.partition("Parameters")[2].partition("Raises")[0]
+    headings = re.findall(r"^    ([a-z_, ]+)$", explained, flags=re.MULTILINE)
+    assert sorted(re.findall(r"\w+", " ".join(headings))) == sorted(names)
 
 
 def test_the_table_of_formats_names_what_is_read():
