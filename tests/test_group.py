@@ -20,12 +20,11 @@ from piccolo.judge.result import Result, nothing_found
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.photo.panorama import Panorama
 from piccolo.system.jobs.threads import Stopwatch, Workers
-from piccolo.together import group
+from piccolo.together import group, mirrored
 from piccolo.together.bundle_search import Support
 from piccolo.together.group import Expected, localize_group, weigh_supports
 from piccolo.together.links import FIRM, WEAK, Links, Placed, compute_shared, find_links, list_pairs, spread
 from piccolo.together.members import Shot
-from piccolo.together.mirrored import refuse_mirrored
 
 TIER = "scene"
 SUPPORT = Support(NO_CANDIDATE, None, is_found=True, odds=1.0, odds_elsewhere=0.0, num_places=100)
@@ -202,24 +201,48 @@ def test_a_mirrored_photo_is_linked_with_none():
     assert find_links(problems, rooms.WORKERS).list_linked(1) == []
 
 
+def _belief(status):
+    """A photo that was localized, or was not, or was refused as mirrored."""
+    belief = make_belief([0.95 if status == "localized" else 0.5])
+    if status == "mirrored":
+        return Result(status="not_localized", belief=belief.rule_out(Reason.MIRRORED))
+    return Result(status=status, belief=belief)
+
+
+@pytest.mark.parametrize(
+    ("alone", "log_odds", "is_refused"),
+    [
+        (("not_localized", "not_localized"), (0.3, 1.1), True),
+        (("not_localized", "not_localized"), (0.3, 0.9), False),
+        (("not_localized", "not_localized"), (-2.0, 1.1), False),  # the first photo tells more
+        (("localized", "not_localized"), (0.3, 1.1), False),
+        (("localized", "mirrored"), (0.3, 1.1), True),
+    ],
+)
+def test_linked_photos_are_refused_if_they_fit_better_mirrored(monkeypatch, alone, log_odds, is_refused):
+    odds = iter(log_odds)
+    monkeypatch.setattr(mirrored, "compare_mirrored", lambda *_: next(odds))
+    members = {k: SimpleNamespace(alone=_belief(status)) for k, status in enumerate(alone)}
+    results = dict.fromkeys(members, _belief("localized")) | {2: _belief("not_localized")}
+    members[2] = SimpleNamespace(alone=results[2])
+    refused = mirrored.refuse_mirrored(results, members, None, 0.9)
+    assert list(refused) == ([0, 1] if is_refused else [])
+    for result in refused.values():
+        assert result.status == "not_localized"
+        assert result.belief.ruled_out == {Reason.MIRRORED}
+        assert result.warnings == (MIRRORED,)
+
+
 @pytest.mark.parametrize("is_mirrored", [False, True])
-def test_photos_together_are_refused_if_they_fit_better_mirrored(is_mirrored):
+def test_a_mirrored_photo_has_less_odds_than_its_mirror_image(is_mirrored):
     ((photo, _),) = rooms.take_photos(SEED, 150.0, {1: [0.0, 0.0, 0.0]})
     if is_mirrored:
         photo = replace(photo, rgb=photo.rgb[:, ::-1], is_valid=photo.is_valid[:, ::-1])
     alone = rooms.locate(photo, rooms.scan_map(SEED), rooms.KNOWN)
     problem = rooms.ask(photo, rooms.scan_map(SEED), rooms.KNOWN)
-    members = {0: SimpleNamespace(found=SimpleNamespace(problem=problem), alone=alone)}
-    together = {0: Result(status="localized", belief=make_belief([0.95]))}
-    result = refuse_mirrored(together, members, {0: SUPPORT}, rooms.means(rooms.KNOWN), 0.9)[0]
-    assert result.status == ("not_localized" if is_mirrored else "localized")
-    assert (Reason.MIRRORED in result.belief.ruled_out) == is_mirrored
-    assert (MIRRORED in result.warnings) == is_mirrored
-
-
-def test_of_photos_that_are_not_localized_the_mirror_images_are_not_searched():
-    unsure = {0: nothing_found()}
-    assert refuse_mirrored(unsure, {}, {}, rooms.means(rooms.KNOWN), 0.9) == unsure
+    member = SimpleNamespace(found=SimpleNamespace(problem=problem))
+    odds = mirrored.compare_mirrored(member, alone, rooms.means(rooms.KNOWN))
+    assert (odds > mirrored.LEAST_LOG_ODDS) == is_mirrored
 
 
 def _together(photos, num_threads=2):

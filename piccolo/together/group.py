@@ -151,12 +151,12 @@ def localize_linked(members: Mapping[int, Member], means: Means, demand: Demand)
             found: dict[int, Result] = {}
             if probabilities[0] >= EVEN_ODDS:
                 found = judge_group(group, tested, probabilities, means, demand)
-                if not list_sure(group, tested[0]):
-                    supports = tested[0].supports
-                    found = refuse_mirrored(found, members, supports, means, demand.min_confidence)
             for k, result in found.items():
                 grouped[k] = Grouped(result, tuple(other for other in found if other != k))
             left -= found.keys() or tested[0].places.keys()
+        results = {k: grouped[k].result if k in grouped else members[k].alone for k in numbers}
+        refused = refuse_mirrored(results, members, means, demand.min_confidence)
+        grouped |= {k: Grouped(result, ()) for k, result in refused.items()}
     return grouped
 
 

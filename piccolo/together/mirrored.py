@@ -16,43 +16,42 @@ from ..judge.selection import assess, rank
 from ..localization.attempts import plan_attempts
 from ..localization.means import Means
 from ..localization.run import make_attempts
-from .bundle_search import Support
 from .members import Member
 
 # Chosen: of mirrored photos, against the photos as they are. Of 15 photos of a hospital none had more than
-# 0.41; two of racks that were mirrored had 1.8 together.
+# 0.41, one of racks that were mirrored 2.3.
 LEAST_LOG_ODDS = 1.0
 
 
 def refuse_mirrored(
-    together: Mapping[int, Result],
-    members: Mapping[int, Member],
-    supports: Mapping[int, Support],
-    means: Means,
-    min_confidence: float,
+    results: Mapping[int, Result], members: Mapping[int, Member], means: Means, min_confidence: float
 ) -> dict[int, Result]:
-    """Return the results of photos together, none of them sure by itself, refused if they were mirrored.
+    """Return the localized ones of photos that are linked, refused, if they were all mirrored; else nothing.
 
-    That is asked if any is localized. Their supports tell how much what each shows counts.
+    No mirrored photo is linked with one that is not. So their mirror images are searched if one of them alone
+    was ruled out as mirrored, or none of those localized was sure alone. The photo that tells most decides.
     """
-    if not any(result.status == LOCALIZED for result in together.values()):
-        return dict(together)
-    odds = sum(supports[k].weight * compare_mirrored(members[k], means) for k in together)
-    if odds < LEAST_LOG_ODDS:
-        return dict(together)
-    return {
-        k: replace(
-            result.take_belief(result.belief.rule_out(Reason.MIRRORED), min_confidence),
-            warnings=(*result.warnings, MIRRORED),
-        )
-        for k, result in together.items()
-    }
+    localized = [k for k, result in results.items() if result.status == LOCALIZED]
+    one_is_mirrored = any(Reason.MIRRORED in members[k].alone.belief.ruled_out for k in results)
+    one_is_sure = any(members[k].alone.status == LOCALIZED for k in localized)
+    if not localized or (one_is_sure and not one_is_mirrored):
+        return {}
+    most = max((compare_mirrored(members[k], results[k], means) for k in localized), key=abs)
+    if most < LEAST_LOG_ODDS:
+        return {}
+    return {k: rule_out_mirrored(results[k], min_confidence) for k in localized}
 
 
-def compare_mirrored(member: Member, means: Means) -> float:
-    """Return the log odds of the best pose of the mirrored photo, less those of the photo's own."""
+def rule_out_mirrored(result: Result, min_confidence: float) -> Result:
+    """Return the result of a photo that was mirrored."""
+    refused = result.take_belief(result.belief.rule_out(Reason.MIRRORED), min_confidence)
+    return replace(refused, warnings=(*refused.warnings, MIRRORED))
+
+
+def compare_mirrored(member: Member, result: Result, means: Means) -> float:
+    """Return the log odds of the best pose of the mirrored photo, less those of the poses of its result."""
     problem = member.found.problem.mirror()
     asked, candidates = make_attempts(plan_attempts(problem), means)
     mirrored = assess(asked.profile, choose(asked, rank(candidates), means.workers))
-    own = member.alone.standings
-    return log_odds(mirrored[0], problem.method) - max(log_odds(one, problem.method) for one in own)
+    own = max(log_odds(standing, problem.method) for standing in result.standings)
+    return log_odds(mirrored[0], problem.method) - own
