@@ -15,7 +15,8 @@ from rooms import room
 from piccolo.geometry.pose import OPTICAL_FROM_CAM, exp_so3
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.photo.camera import Camera, Mount
-from piccolo.photo.camera.model import CUT_SPHERE, MODELS, camera_of_fov, pinhole
+from piccolo.photo.camera.foreign import MODEL_NUMBERS
+from piccolo.photo.camera.model import MODELS, camera_of_fov, pinhole
 from piccolo.photo.camera.resampling import MAX_REMAP_SIDE, CameraView, make_sphere, shrunk, sphere_width
 from piccolo.photo.panorama import read_panorama
 from piccolo.system.errors import InputError
@@ -69,7 +70,12 @@ def test_pixel_to_ray_to_pixel(model):
     assert np.abs(back - pixels)[is_seen].max() < TOLERANCE
 
 
-@pytest.mark.parametrize("model", [model for model in MODELS if model != CUT_SPHERE])
+def test_models_have_the_numbers_of_colmap():
+    theirs = pycolmap.CameraModelId.__members__
+    assert {theirs[model].value: model for model in MODELS if model in theirs} == MODEL_NUMBERS
+
+
+@pytest.mark.parametrize("model", MODEL_NUMBERS.values())
 def test_pixels_are_those_of_colmap(model):
     theirs = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=PARAMS[model])
     this = camera(model)

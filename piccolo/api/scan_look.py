@@ -90,8 +90,13 @@ class Looking:
         """Return the result of a look at a photo, of which `first` is that without the others beside it."""
         if look.series:
             return take_surer(first, others.localize_series(look.series).get(first), look.asked_sha256)
-        if not look.beside:
-            return replace(first, beside=None)
+        if look.beside:
+            return self.look_beside(asked, first, look, others)
+        # `first` has the focal length that others tell; or none of those it was found beside is sure any more
+        return replace(first, beside=None)
+
+    def look_beside(self, asked: Asked, first: Result, look: Look, others: "Others") -> Result:
+        """Return the result of a photo beside those that are sure, with what was asked for it."""
 
         def list_pictures() -> dict[str, SurePhoto]:
             found = ((result.pano, others.place(result)) for result in look.beside)

@@ -213,11 +213,16 @@ def ask_for_coloring(
     return Printed(make_coloring_job(localizer, scan, photos, out, write_steps), report)
 
 
+JOBS: Mapping[str, Callable[..., Printed]] = {  # by the option that asks for it
+    "relative": ask_for_bundle,
+    "together": ask_for_group,
+    "color_scan": ask_for_coloring,
+}
+
+
 def choose_job(arguments: Arguments) -> Callable[..., Printed]:
     """Return the function that makes the job that is asked for, of photos that are no frames."""
-    if arguments.relative:
-        return ask_for_bundle
-    return ask_for_group if arguments.together else ask_for_coloring
+    return next(ask for option, ask in JOBS.items() if getattr(arguments, option))
 
 
 def read_video(arguments: Arguments, folder: Path) -> Iterator[tuple[Path, float, str]]:

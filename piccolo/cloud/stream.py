@@ -212,6 +212,7 @@ class CloudFormat(NamedTuple):
     # MissingChannelError if the file has no such channel
     open_source: Callable[[Path, CloudSettings, Channel], reader.PointSource]
     has_columns: bool = False  # that can be named
+    read_crs: Callable[[Path], str] | None = None  # the system that a file names, empty for none
 
 
 def _begins(*magic: bytes) -> Callable[[bytes], bool]:
@@ -220,8 +221,14 @@ def _begins(*magic: bytes) -> Callable[[bytes], bool]:
 
 FORMATS = (
     CloudFormat("PLY", (".ply",), _begins(*ply.MAGIC), ply.open_ply),
-    CloudFormat("LAS, LAZ", (".las", ".laz"), _begins(las_file.MAGIC), las.open_las),
-    CloudFormat("E57", (".e57",), _begins(e57_file.MAGIC), e57.open_e57),
+    CloudFormat(
+        "LAS, LAZ",
+        (".las", ".laz"),
+        _begins(las_file.MAGIC),
+        las.open_las,
+        read_crs=las_file.read_las_crs,
+    ),
+    CloudFormat("E57", (".e57",), _begins(e57_file.MAGIC), e57.open_e57, read_crs=e57_file.read_e57_crs),
     CloudFormat("PCD", (".pcd",), pcd.FIRST_LINES.match, pcd.open_pcd),
     CloudFormat("PTX", (".ptx",), text.has_ptx_magic, text.open_ptx),
     CloudFormat("PTS", (".pts",), _begins(), partial(text.open_text, has_counts=True), has_columns=True),
@@ -330,9 +337,6 @@ def read_crs(paths: Sequence[Path]) -> str:
     """
     with paths[0].open("rb") as file:
         head = file.read(reader.HEAD_SIZE)
-    text = ""
-    if head.startswith(las_file.MAGIC):
-        text = las_file.read_las_crs(paths[0])
-    elif head.startswith(e57_file.MAGIC):
-        text = e57_file.read_e57_xml(paths[0]).findtext("coordinateMetadata", "")
+    readers = (form.read_crs for form in FORMATS if form.read_crs and form.has_magic(head))
+    text = next((read(paths[0]) for read in readers), "")
     return " ".join(text.split()) if len(text) <= reader.MAX_CRS_LENGTH else ""

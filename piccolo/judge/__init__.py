@@ -3,6 +3,8 @@
 Whatever helps a photo changes its `Belief` in one respect, or gives a pose with errors:
 - `localization.judging`: evidence of the photo alone gives `place`, its errors `within`, its camera `doubt`;
 - `together.bundle`, `together.group`: `believe_together`, by photos whose relative poses are known or found;
+- `together.nearby`: `believe_nearby`, by where the other photos of its group were taken;
+- `together.mirrored`: `ruled_out`, if photos of one place fit better mirrored;
 - `together.beside`: `believe_beside`, by a photo that shows the same;
 - `localization.run`: `share_place` among results with several focal lengths;
 - `judge.conclude`: `follow_consensus`, `doubt` by all photos of a camera (asked by `together.second_looks`);

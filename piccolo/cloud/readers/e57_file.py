@@ -73,6 +73,11 @@ def read_e57_xml(path: Path) -> Element:
     return _parse_xml(path, read_section(path))
 
 
+def read_e57_crs(path: Path) -> str:
+    """Return the coordinate system that a file names; empty if it names none."""
+    return read_e57_xml(path).findtext("coordinateMetadata", "")
+
+
 def read_section(path: Path) -> bytes:
     """Return a file's XML section; InputError if the header is damaged."""
     with path.open("rb") as file:

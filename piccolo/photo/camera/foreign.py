@@ -15,13 +15,25 @@ import numpy as np
 
 from ...system.errors import import_optional
 from ...system.files.json_file import MAX_JSON_SIZE, is_number, read_bytes, read_text
-from .model import CUT_SPHERE, MODELS, Camera
+from .model import MODELS, Camera
 
 READ = "JSON of nerfstudio, Polycam or Record3D, YAML of OpenCV, ROS or Kalibr, XML of OpenCV or Metashape"
-# COLMAP's numbers of the models that are read
-MODEL_NUMBERS = dict(
-    zip((0, 1, 2, 3, 4, 6, 7, 14, 15, 8, 9, 5, 10, 17), (m for m in MODELS if m != CUT_SPHERE), strict=True)
-)
+MODEL_NUMBERS = {  # of those MODELS that COLMAP has, in its binary files
+    0: "SIMPLE_PINHOLE",
+    1: "PINHOLE",
+    2: "SIMPLE_RADIAL",
+    3: "RADIAL",
+    4: "OPENCV",
+    5: "OPENCV_FISHEYE",
+    6: "FULL_OPENCV",
+    7: "FOV",
+    8: "SIMPLE_RADIAL_FISHEYE",
+    9: "RADIAL_FISHEYE",
+    10: "THIN_PRISM_FISHEYE",
+    14: "SIMPLE_FISHEYE",
+    15: "FISHEYE",
+    17: "EQUIRECTANGULAR",
+}
 NUM_COLMAP = 10  # columns: id, qw, qx, qy, qz, tx, ty, tz, camera, name
 POINT_SIZE = 24  # [byte] of a point in images.bin
 MAX_NAME_SIZE = 4096  # [byte]
