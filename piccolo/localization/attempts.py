@@ -33,8 +33,8 @@ from .search import search_poses
 FIRST_BEAM = Beam(100, 12, 4, 1)
 FIRST_ROTATIONS = 1000  # of SO(3)
 FEW_CELLS = 200  # of the grid; if a prior leaves fewer, all of them are searched
-PLACES_AT_ONCE = 32  # at which the scan is drawn before poses are proposed
-COS_TILT = math.cos(math.radians(12.0))  # most angle between their vertical and a known one
+PLACES_AT_ONCE = 32  # places at which the scan is drawn before poses are proposed
+COS_TILT = math.cos(math.radians(12.0))  # of the largest angle between a proposed pose's tilt and a known one
 
 
 class Attempt(Protocol):
@@ -47,13 +47,14 @@ class Attempt(Protocol):
 
 
 def plan_attempts(problem: Problem) -> list[tuple[Problem, Attempt]]:
-    """Return the searches for a photo in order, each with the problem of the evidence that it uses.
+    """Return the searches for a photo in order, each with the problem whose evidence it uses.
 
-    A first look by whole views, or the scan drawn at its poses, may settle a whole upright sphere, and a look
-    along walls a photo of edges. Then come searches by whole views: with gravity `auto` as known, then as
-    unknown (briefly, for a whole sphere). Matches with the scan drawn at its places come last, as these may
-    have to be drawn, but first for photos of any tilt. Partial photos are mostly taken about level: with a
-    tilt that is not known exactly, "known" searches about level, first the few best starts.
+    Brief looks come first: for a whole upright sphere by whole views, then with the scan drawn at the poses
+    found; for a photo of edges along the walls. Searches by whole views follow, with gravity `auto` at the
+    known tilt, then at any tilt (briefly, for a whole sphere). The search by matches with the scan drawn at
+    the map's places is last, as these may have to be drawn; only for partial photos of any tilt it precedes
+    the views. Partial photos are mostly taken about level: if the tilt is not known exactly, "known" searches
+    about level, and begins with a brief search.
     """
     profile = problem.profile
     looks_first = profile.uses_matches and can_look_first(problem)
@@ -76,7 +77,7 @@ def plan_attempts(problem: Problem) -> list[tuple[Problem, Attempt]]:
 
 
 def look_first(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
-    """Search briefly by whole views; True if one pose alone is clear and beats the mirrored photo."""
+    """Search briefly by whole views; True if one pose alone explains the photo, better than if mirrored."""
     effort, workers, watch, _ = means
     of_mirror = Once(score_mirror, problem, effort, workers)
     with workers.beside(of_mirror):
@@ -91,18 +92,18 @@ def look_first(problem: Problem, known: list[Candidate], means: Means) -> tuple[
 
 
 def beats_mirror(method: Method, own: float, mirrored: float) -> bool:
-    """Return True if first scores tell a photo from its mirror image."""
+    """Return True if by brief scores a photo fits better as it is than mirrored."""
     return own >= method.first_mirror_ratio * mirrored
 
 
 def draw_found(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
-    """Draw the scan at the poses that were found; True if the best is sure."""
+    """Draw the scan at the best of the known candidates; True if the best of all is sure."""
     with means.watch.stage("refine"):
         return end_search(problem, known, means.workers)
 
 
 def look_along_walls(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
-    """Search the few rotations of a photo whose lines lie along walls; True if one pose alone is clear."""
+    """Search the few rotations that put a photo's lines along walls; True if one pose alone explains it."""
     refined = search_and_refine(problem, "known", FIRST_BEAM, means)
     with means.watch.stage("refine"):
         found = known + refined
@@ -112,7 +113,7 @@ def look_along_walls(problem: Problem, known: list[Candidate], means: Means) -> 
 def search_features(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
     """Match a photo with the scan drawn at its places, some at a time; True if the result is sure.
 
-    Poses by some of the places are dropped unless they are sure: all find better ones.
+    Poses by the first places are dropped unless one is sure: all places together give better ones.
     """
     workers = means.workers
     places = problem.scan_map.places
@@ -121,14 +122,14 @@ def search_features(problem: Problem, known: list[Candidate], means: Means) -> t
     with means.watch.stage("match"):
         keypoints = find_all_around(problem.photo, workers)
     likely = np.array([one.pose.center_world for one in known]).reshape(-1, 3)
-    asked = places.choose(problem.scan_map.centers[problem.scan_map.sparse], likely)
-    for begin in range(0, len(asked), PLACES_AT_ONCE):
+    chosen = places.choose(problem.scan_map.centers[problem.scan_map.sparse], likely)
+    for begin in range(0, len(chosen), PLACES_AT_ONCE):
         end = begin + PLACES_AT_ONCE
         with means.watch.stage("match"):
-            pictures = places.draw(asked[begin:end].tolist(), workers)
+            pictures = places.draw(chosen[begin:end].tolist(), workers)
             matched += workers.map(partial(match_located, keypoints), pictures, "match")
             poses = propose_level(problem, merge_matches(matched), workers)
-            is_last = end >= len(asked)
+            is_last = end >= len(chosen)
             if not is_last and (not poses or poses[0].num_matches < problem.method.enough_matches):
                 continue
             refined = refine_matches(problem, [one.pose for one in poses], workers)
@@ -177,7 +178,7 @@ def add_found(
 
 
 def end_search(problem: Problem, found: list[Candidate], workers: Workers) -> tuple[list[Candidate], bool]:
-    """Return the candidates with what was drawn at them; True if the best is sure."""
+    """Draw the scan at the best candidates; return all with their evidence, and True if the best is sure."""
     ranked = rank(found)
     if ranked.best.score < problem.method.faint_score:
         return found, False
@@ -212,9 +213,9 @@ def add_verified(problem: Problem, candidates: list[Candidate], workers: Workers
 
 
 def search_beyond_prior(problem: Problem, scan_map: ScanMap, means: Means) -> list[Candidate]:
-    """Search a whole photo without the prior: poses that agree with it must beat those that it excludes."""
-    is_asked = not problem.prior.is_empty and can_look_first(problem)
-    if not is_asked:
+    """Search a whole photo without its prior: poses that the prior allows must beat those it excludes."""
+    is_needed = not problem.prior.is_empty and can_look_first(problem)
+    if not is_needed:
         return []
     anywhere = replace(problem, scan_map=scan_map, prior=NOTHING_KNOWN)
     brief = means._replace(effort=means.effort.brief())
@@ -230,7 +231,8 @@ def can_look_first(problem: Problem) -> bool:
 def thin_out(problem: Problem) -> Problem:
     """Return the problem with every other cell of the grid, for a whole photo that was searched as upright.
 
-    With few rotations (`thin_effort`) that finds tilted photos without occluders; features find the others.
+    With few rotations (`thin_effort`), this finds tilted photos without occluders; the search by local
+    features finds the others.
     """
     m = problem.scan_map
     cells = np.floor(m.centers[m.sparse] / COARSE_SPACING).astype(np.int64)

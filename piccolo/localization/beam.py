@@ -65,7 +65,7 @@ def refine_starts(problem: Problem, starts: Starts, beam: Beam, workers: Workers
 
 
 def refine_matches(problem: Problem, poses: Sequence[Pose], workers: Workers) -> list[Candidate]:
-    """Descend on fine cells from poses of matches; keep the better of each start and end, best first."""
+    """Descend on fine cells from poses by matches; keep the better of each start and end, best first."""
 
     def refine_match(pose: Pose) -> Candidate:
         end = refine(problem, pose, workers, FINE).pose
@@ -75,7 +75,7 @@ def refine_matches(problem: Problem, poses: Sequence[Pose], workers: Workers) ->
 
 
 def keep_ends(ends: Ends, count: int) -> Starts:
-    """Keep the distinct best ends and alternatives."""
+    """Keep `count` of the ends: the best ones, and some that lie far apart (`best_and_alternatives`)."""
     poses = ends.poses
     return poses.take(best_and_alternatives(poses.R_cam_from_map, poses.center_map, count, DESCENDING))
 
@@ -91,9 +91,9 @@ def best_and_alternatives(rotations: Array, centers: Array, count: int, near: Ne
     return np.sort(np.concatenate([best, others]))
 
 
-def narrow(fits: Sequence[Hypothesis], count: int) -> list[Pose]:
-    """Return the `best_and_alternatives` of the fits, ranked by score."""
-    ranked = [f.pose for f in sort_by_score(fits)]
+def narrow(ends: Sequence[Hypothesis], count: int) -> list[Pose]:
+    """Return `count` of the ends by `best_and_alternatives`, ranked by score."""
+    ranked = [end.pose for end in sort_by_score(ends)]
     rotations = np.array([pose.R_cam_from_world for pose in ranked])
     centers = np.array([pose.center_world for pose in ranked])
     return [ranked[k] for k in best_and_alternatives(rotations, centers, count, DESCENDED)]
@@ -105,9 +105,9 @@ def keep_distinct(fine: Sequence[Hypothesis], middle: Sequence[Hypothesis], most
 
 
 def keep_comparable(ranked: Sequence[Hypothesis], faint_part: float) -> list[Hypothesis]:
-    """Drop the fits that score far below the best: a comparison could not bring them near it."""
-    least = faint_part * max((f.score for f in ranked), default=0.0)
-    return [f for f in ranked if f.score >= least]
+    """Drop the poses that score far below the best: a full comparison could not bring them near it."""
+    least = faint_part * max((one.score for one in ranked), default=0.0)
+    return [one for one in ranked if one.score >= least]
 
 
 def descend_briefly(problem: Problem, effort: Effort, workers: Workers) -> Ends:

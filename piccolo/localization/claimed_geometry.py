@@ -33,22 +33,22 @@ from ..system.arrays import Array, Array32
 from ..system.jobs.threads import Workers
 from .last_descent import refine_best
 
-MIN_CALIBRATED_SCORE_LEFT = 0.95  # fraction of the score that it must keep
+MIN_CALIBRATED_SCORE_LEFT = 0.95  # fraction of the score that a pose must keep with another focal length
 MAX_CALIBRATIONS = 4  # fits of a focal length
 SUSPECT = 0.8  # deviations between claim and picture, from which other geometries are searched
-CONTRADICTED_DEVIATIONS = 3.0  # from which one that explains more is taken
-MIN_RETAKE_GAIN = 1.1  # times the score, by another geometry
+CONTRADICTED_DEVIATIONS = 3.0  # between claim and picture, from which another geometry may replace the claim
+MIN_RETAKE_GAIN = 1.1  # times the score with the claim: what another geometry must reach
 MOST_ROUNDS = 3
 CHECK_LIMITS = Limits(1.0, 8, 1e-3)
 FULL_LIMITS = Limits(0.7, 15, 1e-4)  # on points, where the claim does not hold
-HERE_LIMITS = Limits(0.7, 1, 1e-4)  # and where it does, which tells how exact it is
+HERE_LIMITS = Limits(0.7, 1, 1e-4)  # on points, where the claim holds: the end shows how exact it is
 
 
 def calibrate(problem: Problem, found: Selection, workers: Workers) -> tuple[Problem, Selection, FocalFit]:
-    """Fit the focal length at the best pose, and refine the poses with it, until it is at rest.
+    """Fit the focal length at the best pose, and refine the poses with it, until it hardly changes.
 
-    The last change is applied too, so that what is found lies between what was given and what the picture
-    says.
+    The last change is applied too, so that the focal length found lies between the given one and that of the
+    picture.
     """
     problem, found = follow_matches(problem, found, workers)
     fit = fit_focal(problem, found.best, workers)
@@ -79,14 +79,14 @@ def find_change_left(panorama: Panorama, fit: FocalFit) -> Array:
 def refine_with(
     problem: Problem, found: Selection, change: Array, best: Pose, workers: Workers
 ) -> tuple[Problem, Selection]:
-    """Refine the poses with another calibration, of which the best is `best`."""
+    """Refine the poses with another calibration, the best one from `best`."""
     problem = recalibrate(problem, change, workers)
     poses = [best, *(h.pose for h in found.alternatives)]
     return problem, refine_best(problem, examine_each(problem, poses, workers), workers)
 
 
 def follow_matches(problem: Problem, found: Selection, workers: Workers) -> tuple[Problem, Selection]:
-    """Begin with the focal length by which most matches agree, if that is clearly another."""
+    """Replace the focal length by the one with which most matches agree, if the two clearly differ."""
     matches = list_matches(problem, found.best, workers)
     by_matches = fit_matches(problem.method, problem.given.cameras[0], found.best.pose, matches, FOCAL_WIDTHS)
     change = float(by_matches.values[FOCAL])
@@ -97,7 +97,7 @@ def follow_matches(problem: Problem, found: Selection, workers: Workers) -> tupl
 
 
 def recalibrate(problem: Problem, change: Array, workers: Workers) -> Problem:
-    """Prepare the problem again with another calibration; its matches stay, and their rays follow."""
+    """Prepare the problem again with another calibration; its matches stay, with other rays."""
     given = problem.given
     before = given.cameras[0]
     after = before.with_camera(before.camera.change(*change))
@@ -115,7 +115,7 @@ def _turn_rays(rays: Array32, before: Mount, after: Mount) -> Array32:
 def calibrate_sphere(
     problem: Problem, found: Selection, workers: Workers
 ) -> tuple[Problem, Selection, SphereFit]:
-    """Compare what a panorama claims with the scan; refine the poses if it shows otherwise."""
+    """Compare the part of the sphere that a panorama claims with the scan; refine if it is wrong."""
     camera = whole_sphere(*problem.given.rgb.shape[1::-1])
     freedom = make_freedom(camera)
     pose = found.best.pose
@@ -141,9 +141,9 @@ def calibrate_sphere(
 def retake_as_found(
     problem: Problem, found: Selection, claimed: Camera, workers: Workers
 ) -> tuple[Problem, Selection, SphereFit] | None:
-    """Search other geometries; return the problem with one that explains clearly more, refined, or None.
+    """Search other geometries; return problem and poses with one that explains clearly more, else None.
 
-    One that explains less than what the photo claims already does is not refined.
+    A geometry that explains less than the claimed one is not refined.
     """
     end = search_geometry(problem, found.best.pose, claimed, workers)
     if count_deviations(estimate_corrections(end, SPHERE_CURVATURE)) < CONTRADICTED_DEVIATIONS:

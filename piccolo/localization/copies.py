@@ -17,9 +17,9 @@ from .shape import find_alike
 def list_reported(
     problem: Problem, found: Selection, effort: Effort, workers: Workers
 ) -> tuple[Selection, list[bool]]:
-    """Return the selection with the alternatives to report; True for poses that are copies, the best first.
+    """Return the selection with the alternatives to report; for each pose, True if it is a copy of the place.
 
-    In a scan without colours copies are searched.
+    The best pose, which is the first, counts as one. In a scan without colours, copies are searched for.
     """
     if not problem.profile.has_shape:
         reported = found.take(found.candidates[: 1 + MAX_ALTERNATIVES])
@@ -30,16 +30,16 @@ def list_reported(
 
 
 def put_first(found: Selection, copies: Sequence[Candidate]) -> tuple[Selection, list[bool]]:
-    """Return the selection with copies of its place before other poses; True for them and the best."""
+    """Return the selection with the copies before other alternatives; True for the best and each copy."""
     others = suppress_near([*copies, *found.alternatives], MAX_ALTERNATIVES, ONE_ANSWER)
     is_copy = [any(other is copy for copy in copies) for other in others]
     return found.take([found.best, *others]), [True, *is_copy]
 
 
 def list_copies(problem: Problem, ranked: Sequence[Candidate], one: int, workers: Workers) -> list[bool]:
-    """Return True for one of ranked candidates, and for copies of its place; False without matches.
+    """Return True for candidate `one` of the ranked, and for copies of its place; all False without matches.
 
-    Only those are compared with it that could win beside it or the best, which is the first.
+    Only candidates that could still win are compared with it. The first of the ranked is the best.
     """
     if not problem.profile.uses_matches:
         return [False] * len(ranked)

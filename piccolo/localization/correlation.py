@@ -18,8 +18,8 @@ EXACT = (1 << 24) - 1  # whole numbers up to this are exact in float32
 MOST_LEVEL = 127.5  # of a channel
 MOST_ENERGY = 3.0 * MOST_LEVEL**2  # of a cell
 VIEWS_A_PRODUCT = 512  # views a matrix product, at most
-LEAST_SEEN = 0.3  # of what a photo shows, by a view that it is compared with
-ALL_SEEN = np.float32(255.0)  # of a view's cell
+LEAST_SEEN = 0.3  # fraction of what a photo shows that a view must see to be compared with it
+ALL_SEEN = np.float32(255.0)  # the number that stands for a view's cell that is seen wholly
 FLAT_VIEW = 6.0  # [levels] a smaller deviation counts as this
 Samples = Array32
 
@@ -31,11 +31,14 @@ class TurnedPanorama(NamedTuple):
     energy: Samples  # (rotations, cells) squared channels times solid angle, 0 where nothing is shown
     validity: Samples  # (rotations, cells) 1 where the panorama shows something
     area: Samples  # (cells,) solid angles, relative to the largest
-    most_seen: int  # fraction seen of a cell of a view, at most: all of it
+    most_seen: int  # the number that stands for a view's cell that is seen wholly: 255, or 1 of a mask
 
 
 def to_whole_numbers(values: Samples, most: float, most_other: int, num_terms: int) -> Samples:
-    """Scale and round values up to `most`, so that sums of products with numbers up to another are exact."""
+    """Scale and round values of at most `most`, so that sums of `num_terms` products are exact.
+
+    They are products with whole numbers of at most `most_other`.
+    """
     return np.asarray(np.rint(values * whole_scale(most, most_other, num_terms)))
 
 

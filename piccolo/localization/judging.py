@@ -1,6 +1,6 @@
 """A photo's way from its refined poses to a result: evidence is gathered, then the judge decides.
 
-Photos that help each other end here too, each with a pose and probabilities that others told.
+Photos that help each other end here too, each with a pose and probabilities to which others contributed.
 """
 
 from dataclasses import replace
@@ -36,7 +36,7 @@ class Found(NamedTuple):
     fit: Fit | None  # None if the poses are faint, or nothing was fitted
 
     def forget(self) -> "Found":
-        """Return this without what takes memory."""
+        """Return the poses without the images and matches, which take memory."""
         return Found(self.problem.forget(), self.selection.forget(), self.fit)
 
 
@@ -69,7 +69,7 @@ def judge(found: Found, means: Means, demand: Demand, may_promote: bool = True) 
 def promote(
     problem: Problem, selection: Selection, copy: Candidate, fit: Fit | None, workers: Workers
 ) -> Found:
-    """Make a copy of the best pose's place the best."""
+    """Put a copy of the best pose's place first, refined, with the evidence that belongs to it."""
     best = settle(problem, copy, workers)
     others = [h for h in selection.candidates if h.pose is not copy.pose]
     ratios = [h.seen.compute_ratio(best.seen) for h in others]
@@ -86,11 +86,11 @@ def judge_together(
     means: Means,
     min_confidence: float,
 ) -> Result:
-    """Return the result of a photo whose pose is what it and others say together.
+    """Return the result of a photo whose pose was estimated from this photo and others together.
 
-    `gaussian` is that pose in the map; the best candidate has the same pose. `belief` is in it and each
-    alternative, by all photos together, without doubt about a focal length. What the photo itself rules out
-    stays so.
+    `gaussian` is that pose in the map; the best candidate has the same pose. `belief` is in this pose and
+    each alternative, by all photos together, without doubt about a focal length. A pose that the photo itself
+    rules out stays ruled out.
     """
     problem, selection, fit = found
     selection = complete(problem, selection, means.workers)
@@ -109,7 +109,7 @@ def judge_together(
 
 def decide_case(problem: Problem, case: Case, belief: Belief, means: Means, min_confidence: float) -> Result:
     """Return the result of a case; the mirrored photo is searched if any pose is likely."""
-    if case.geometry is not None:  # no pose is surer than what it rests on
+    if case.geometry is not None:  # no pose is surer than the geometry that it rests on
         belief = replace(belief, doubt=case.geometry.doubt)
     best = case.found.best
     if belief.sound_places[-1] < 1.0 - problem.method.worth_asking:
@@ -121,7 +121,7 @@ def decide_case(problem: Problem, case: Case, belief: Belief, means: Means, min_
 
 
 def describe_case(problem: Problem, case: Case, belief: Belief) -> Step:
-    """Describe what the judge read of a photo, and what is believed."""
+    """Describe the evidence of a photo that the judge has read, and the belief that follows."""
     return {
         "place": list(belief.place),
         "within": belief.within,

@@ -26,15 +26,15 @@ from ..system.kernels.jit import kernel
 from ..views.points_around import PLACE_SPACING
 from ..views.view import Cells
 
-PERTURBED_BATCH = 3  # perturbed poses that a thread takes
+PERTURBED_BATCH = 3  # perturbed poses that a thread takes at a time
 MAX_UNOCCLUDED = 2  # rounds that mask occluders
 MIN_POINTS_SCORE_LEFT = 0.9  # fraction of the score that a descent on points must keep
 
 
 def refine(problem: Problem, start: Pose, workers: Workers, stage: Stage) -> Hypothesis:
-    """Descend from a pose through a stage, on what is seen from there.
+    """Descend from a pose as a stage says, on the cells or points of the scan that are seen from there.
 
-    The score of the end is that on the cells of the view; nan on points.
+    The end is scored on the cells of the view; on points its score is nan.
     """
     cells = problem.view_at(start, stage.view)
     if stage.around is None:
@@ -79,7 +79,8 @@ def climb_by(perturb: Callable[[Hypothesis], Hypothesis], best: Hypothesis, meth
 def climb_from_afar(problem: Problem, start: Pose, workers: Workers) -> tuple[Pose, Pose]:
     """Descend from a pose, and from poses around the end for as long as the score on fine cells rises.
 
-    Nothing is gained if they all lead back to the end. Return also the pose from which its cells were seen.
+    It stops when all of these lead back to the same end. Return also the pose from which the cells of the
+    best end were seen.
     """
     end = seen_from = refine(problem, start, workers, MIDDLE).pose
     best = refine(problem, end, workers, FINE)
@@ -101,7 +102,7 @@ def climb_from_afar(problem: Problem, start: Pose, workers: Workers) -> tuple[Po
 def climb_unoccluded(problem: Problem, start: Candidate, workers: Workers) -> Candidate:
     """Mask occluders and refine the pose, in rounds.
 
-    Its evidence is that of the whole photo; `unoccluded` is the photo as it was masked last.
+    The candidate returned has the evidence of the whole photo; its `unoccluded` is the photo as masked last.
     """
     best = start
     for _ in range(MAX_UNOCCLUDED):
@@ -126,7 +127,7 @@ def climb_whole(problem: Problem, start: Candidate, workers: Workers) -> Candida
 
 
 def climb_masked(problem: Problem, start: Candidate, workers: Workers) -> Candidate:
-    """Climb from a candidate, and from poses around it, with the photo that is masked there."""
+    """Climb from a candidate, and from poses around it, with its masked photo."""
     assert start.unoccluded is not None
     masked = problem.show(start.unoccluded.photo)
     around = refine(masked, start.pose, workers, AROUND_MIDDLE)
@@ -141,23 +142,23 @@ def climb_to_full(problem: Problem, start: Candidate, workers: Workers) -> Candi
 
 def settle(problem: Problem, found: Candidate, workers: Workers) -> Candidate:
     """Descend until the pose converges, so that it does not depend on where the search began."""
-    shown = mask_occluders(problem, found.seen, found.unoccluded)
-    return converge(problem, replace(found, unoccluded=shown), LAST, workers)
+    masked = mask_occluders(problem, found.seen, found.unoccluded)
+    return converge(problem, replace(found, unoccluded=masked), LAST, workers)
 
 
 def converge(problem: Problem, found: Candidate, stage: Stage, workers: Workers) -> Candidate:
     """Descend on the points visible from the pose, in the rounds of a stage.
 
-    It descends with the candidate's unoccluded photo; an end below MIN_POINTS_SCORE_LEFT of its score is
-    discarded.
+    The descent uses the candidate's `unoccluded` photo. If the end keeps less than MIN_POINTS_SCORE_LEFT of
+    the candidate's score, the candidate is returned.
     """
     assert found.unoccluded is not None
-    shown = problem.show(found.unoccluded.photo)
+    masked = problem.show(found.unoccluded.photo)
     pose = found.pose
     for k in range(stage.rounds.most):
         center = pose.center_world
         for each in (*problem.profile.soft, stage) if k == 0 else (stage,):
-            pose = descend_on(shown, shown.view_at(pose, each.view), pose, each).pose
+            pose = descend_on(masked, masked.view_at(pose, each.view), pose, each).pose
         if math.dist(pose.center_world, center) < stage.rounds.arrived:
             break
     end = examine(problem, pose, found)
@@ -183,8 +184,8 @@ def descend_perturbed(
 ) -> None:
     """Perturb poses (n, 3, 3), (n, 3) by steps (n, 6) and descend in place, on the coarse then fine image.
 
-    These are PERTURBED_BATCH poses from `begin` on. `num_iterations` are those on each image. A pose with the
-    zero step skips the coarse one.
+    One call takes PERTURBED_BATCH poses, from `begin` on. `num_iterations` are for the coarse and the fine
+    image. A pose whose step is zero skips the coarse image.
     """
     R = R_cam_from_map
     t = center

@@ -40,7 +40,7 @@ def refine_best(problem: Problem, candidates: Sequence[Candidate], workers: Work
 def part_near(
     method: Method, found: Selection, counts: Sequence[int]
 ) -> tuple[list[Candidate], list[Candidate]]:
-    """Part the alternatives, with their matches, in those that come near the best and others."""
+    """Divide the alternatives: those near the best, by score or by `counts` of matches, and the others."""
     near: list[Candidate] = []
     far: list[Candidate] = []
     for h, count in zip(found.alternatives, counts, strict=True):
@@ -52,7 +52,7 @@ def part_near(
 def settle_best(problem: Problem, found: Selection, workers: Workers) -> Selection:
     """Refine the best pose to convergence; repeat if another becomes the best."""
     at_rest: list[Candidate] = []
-    with workers.beside(partial(problem.surroundings_at, found.best.pose)):  # it hardly moves
+    with workers.beside(partial(problem.surroundings_at, found.best.pose)):  # the pose hardly moves
         for _ in range(1 + len(found.alternatives)):
             best = settle(problem, found.best, workers)
             at_rest.append(best)

@@ -14,13 +14,13 @@ Step = dict[str, Any]
 
 @dataclass(frozen=True)
 class Trace:
-    """The steps of a photo's search, for who asks why it was found where it was, or was not found."""
+    """The steps of a photo's search, from which follows why it was found at a place, or not found."""
 
     is_wanted: bool = False
     steps: list[Step] = field(default_factory=list)
 
     def note(self, step: str, describe: Callable[[], Step]) -> None:
-        """Note a step, if it is wanted."""
+        """Note a step, if the trace is wanted."""
         if self.is_wanted:
             self.steps.append({"step": step, **describe()})
 

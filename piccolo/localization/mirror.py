@@ -23,10 +23,10 @@ UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 
 
 def find_mirrored(problem: Problem, best: Candidate, effort: Effort, workers: Workers) -> Candidate | None:
-    """Return the best pose of the mirrored photo; None if there is none that explains more.
+    """Return the best pose of the mirrored photo; None if it explains no more than the photo's own best.
 
-    Not searched are photos that are explained well and have many matches, scans without colours, and poses by
-    whole views alone: the first look has compared these with the mirrored photo.
+    The mirrored photo is not searched if the photo is explained well and has many matches, if the scan has no
+    colours, and if the pose is by whole views alone, as the first look has then compared both.
     """
     if is_explained(problem.method, best) or not problem.profile.uses_matches:
         return None
@@ -48,21 +48,22 @@ def is_explained(method: Method, best: Candidate) -> bool:
 def search_mirrored(
     problem: Problem, mirrored: Problem, pose: Pose, effort: Effort, workers: Workers
 ) -> list[Candidate]:
-    """Return poses of the mirrored photo, best first, by what found the photo's own: features, or views.
+    """Return poses of the mirrored photo, best first, by whole views.
 
-    A wall or a ceiling seen from behind fits the mirrored photo: its tilt is that of the pose found, or that
-    upside down. The search is brief if a brief one finds the photo's own pose, of all poses the best.
+    A wall or a ceiling seen from behind fits the mirrored photo, so that this has the tilt of the photo's own
+    pose, or that tilt upside down. The search is brief if a brief search of the photo as it is ends, with the
+    best of its scores, at the photo's own pose.
     """
-    asked = replace(mirrored, rotations=list_mirrored(pose.R_cam_from_world, effort.num_yaws))
+    turned = replace(mirrored, rotations=list_mirrored(pose.R_cam_from_world, effort.num_yaws))
     own = replace(problem, rotations=pose.R_cam_from_world @ uniform_yaws(effort.num_yaws))
     own_ends = descend_briefly(own, effort.brief(), workers)
     if not is_found_again(own_ends, pose):
-        starts = search_poses(asked, "known", effort, workers)
-        return refine_starts(asked, starts, problem.profile.beam, workers)
-    ends = descend_briefly(asked, effort.brief(), workers)
-    return (
-        refine_starts(asked, ends.poses, FIRST_BEAM, workers) if ends.best_score > own_ends.best_score else []
-    )
+        starts = search_poses(turned, "known", effort, workers)
+        return refine_starts(turned, starts, problem.profile.beam, workers)
+    ends = descend_briefly(turned, effort.brief(), workers)
+    if ends.best_score <= own_ends.best_score:
+        return []
+    return refine_starts(turned, ends.poses, FIRST_BEAM, workers)
 
 
 def list_mirrored(R_cam_from_map: Array, num_yaws: int) -> Array:

@@ -1,4 +1,4 @@
-"""A photo near a pose that is known from elsewhere: its own pose there, and how likely that is."""
+"""A photo that is expected near a given pose: the pose to which it descends, and how likely that is right."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -33,12 +33,12 @@ class Near(NamedTuple):
 def refine_near(problem: Problem, start: Pose, workers: Workers) -> Near:
     """Descend from a pose and from poses around it, then on the points, and judge the end (`assess_end`).
 
-    A partial photo converges slowly: its descent goes on.
+    A partial photo converges slowly: its descent goes on until it settles.
     """
     middle, seen_from = climb_from_afar(problem, start, workers)
     pose = refine(problem, middle, workers, FULL).pose
-    seen = compare(problem, pose, seen_from=seen_from if pose.distance(seen_from) < NEARLY else pose)
-    end = Candidate(pose, seen.score, seen, contradictions(problem.scan_map, pose, problem.prior))
+    compared = compare(problem, pose, seen_from=seen_from if pose.distance(seen_from) < NEARLY else pose)
+    end = Candidate(pose, compared.score, compared, contradictions(problem.scan_map, pose, problem.prior))
     if problem.profile.settles_near:
         end = settle(problem, end, workers)
     errors = UNKNOWN_ERRORS
@@ -51,9 +51,10 @@ def refine_near(problem: Problem, start: Pose, workers: Workers) -> Near:
 
 
 def assess_end(problem: Problem, end: Candidate, workers: Workers) -> Standing:
-    """Return the evidence for a pose by whole views; of a narrow photo by its matches there too.
+    """Return the evidence for a pose by whole views, and for a narrow photo also by its matches there.
 
-    Matches do not count if they put the photo elsewhere, with photos beside or without.
+    A pose is fitted to the matches with the photos beside, and one without these. Matches of a fitted pose
+    that is elsewhere do not count; of the two counts the larger is taken.
     """
     by_views = problem.by_views()
     (standing,) = assess_alone(by_views.profile, complete(by_views, Selection(end, ()), workers).candidates)

@@ -27,8 +27,8 @@ from ..system.jobs.threads import Stopwatch, Workers
 from ..views.zbuffer import is_free_space, render_view, visible_points
 from .paper_descent import DescentSettings, Loss, Refined, make_sampling_loss, refine_by_solver
 
-# No covariance is known here, and too few alternatives to tell places that repeat: a rough guide, by margin
-# and log of the agreement, learnt without such places.
+# A rough guide, as this preset has no covariance, and too few alternatives to notice places that repeat. The
+# weights are those of the margin and the log of the agreement, learnt in scans without such places.
 PAPER_BIAS = -0.20
 PAPER_WEIGHTS = (6.37, 2.51)
 PROBE_WIDTH = 48  # cells of 7.5 degrees for the two tests
@@ -180,10 +180,10 @@ def search(
     rotations = (uniform_yaws if is_level else uniform_rotations)(settings.effective_num_rotations)
 
     def losses(center_world: Array) -> list[Hypothesis]:
-        seen = visible_points(points, center_world) if settings.use_visibility else points
+        visible = visible_points(points, center_world) if settings.use_visibility else points
         poses = [Pose(R_cam_from_world, center_world) for R_cam_from_world in rotations]
-        found = [Hypothesis(pose, -loss.value(seen, pose)) for pose in poses]
-        return [h for h in found if np.isfinite(h.score)]
+        hypotheses = [Hypothesis(pose, -loss.value(visible, pose)) for pose in poses]
+        return [h for h in hypotheses if np.isfinite(h.score)]
 
     scored = [h for batch in workers.map(losses, list(paper_map.positions), "search") for h in batch]
     near = Nearness(settings.min_distance, math.radians(settings.min_angle_deg))
@@ -226,7 +226,10 @@ def localize_by_paper(
 
 
 def believe_roughly(evidence: Evidence, num_others: int) -> Belief:
-    """Return a rough belief in the best pose and in others, which share alike what their scores cost it."""
+    """Return a rough belief in the best pose and in the others.
+
+    The others share equally the confidence that the best one loses by their scores.
+    """
     best = paper_confidence(evidence)
     alone = paper_confidence(replace(evidence, margin=1.0))
     return make_belief([best, *[(alone - best) / max(num_others, 1)] * num_others])

@@ -53,7 +53,7 @@ def make_sampling_loss(texels: Texels) -> Loss:
 
 @dataclass
 class Refined:
-    """The best pose of a descent; its loss in a result of `refine` is over the points visible from it."""
+    """The best pose of a descent, and its loss: at the end of all, over the points visible from the pose."""
 
     pose: Pose
     loss: float = np.inf
@@ -94,7 +94,7 @@ class Adam:
 
 
 def descend_adam(objective: Objective, pose: Pose, adam: Adam, num_iterations: int) -> Refined:
-    """Take `num_iterations` steps of `adam`, whose state goes on; return the best pose."""
+    """Take `num_iterations` steps of `adam`, which keeps its state; return the best pose."""
     best = Refined(pose)
     for _ in range(num_iterations):
         loss, gradient, _ = objective(pose)
@@ -146,22 +146,22 @@ def descend_gauss_newton(objective: Objective, start: Pose, num_iterations: int)
 def refine_by_solver(points: PackedPoints, loss: Loss, start: Pose, settings: DescentSettings) -> Refined:
     """Descend from `start`, leaving out the points hidden from the camera; these are found `num_culls` times.
 
-    That changes the function, so losses before and after it are not comparable: the result is the best pose
-    of the last part.
+    Leaving out other points changes the loss, so that its values before and after are not comparable: the
+    result is the best pose of the last part of the descent.
     """
     adam = Adam(settings.step_size, settings.step_decay, settings.patience)
     bounds = np.linspace(0, settings.num_iterations, settings.num_culls + 1).astype(int)
     pose = start
 
-    def find_seen(at: Pose) -> PackedPoints:
+    def find_visible(at: Pose) -> PackedPoints:
         return visible_points(points, at.center_world) if settings.use_visibility else points
 
     for num_iterations in np.diff(bounds).tolist():
-        objective = partial(loss.equations, find_seen(pose))
+        objective = partial(loss.equations, find_visible(pose))
         if settings.solver == "adam":
             adam.best_loss = np.inf
             pose = descend_adam(objective, pose, adam, num_iterations).pose
         else:
             descend = descend_lbfgs if settings.solver == "lbfgs" else descend_gauss_newton
             pose = descend(objective, pose, num_iterations).pose
-    return Refined(pose, loss.value(find_seen(pose), pose))
+    return Refined(pose, loss.value(find_visible(pose), pose))

@@ -31,9 +31,9 @@ from .last_descent import refine_best
 from .means import Means, Step, describe_candidates, describe_selection
 from .shape import align_level, find_tilts, is_explained_by_edges, is_tilt_known
 
-# added to the log of the focal length: one comes near enough to any that is 20 % off
+# changes of a guessed focal length's logarithm: one comes near enough to a true one that differs by 20 %
 GUESSES = (0.0, -0.15, 0.15)
-MOST_RANGE = 10.0  # [m] of what is seen: a pose moves by this times the change of the focal length's log
+MOST_RANGE = 10.0  # [m] of surfaces: times the change of the focal length's log, it is how far a pose moves
 NO_PIXEL = "the panorama: no pixel counts, all are masked"
 
 
@@ -63,48 +63,48 @@ def prepare_search(
 
 
 def explain_nothing(scan_map: ScanMap, panorama: Panorama, prior: Prior) -> Result:
-    """Return the result where there is nothing to search, with the reason."""
+    """Return the result of a photo that can be searched nowhere, with the reason."""
     if len(apply_prior(scan_map, prior).sparse) > 0:
         return nothing_found(NO_PIXEL)
-    is_told = len(scan_map.centers) > 0  # else the scan has no position at all
-    belief = NOTHING.rule_out(Reason.NOWHERE) if is_told else NOTHING
+    has_positions = len(scan_map.centers) > 0  # then the prior excludes all of them
+    belief = NOTHING.rule_out(Reason.NOWHERE) if has_positions else NOTHING
     return nothing_found(nothing_allowed(scan_map, prior), belief=belief)
 
 
 def find(problem: Problem, scan_map: ScanMap, means: Means) -> Found:
     """Search until one attempt is sure, and refine the best poses to the end.
 
-    The problem has the part of the map that its prior allows.
+    `scan_map` is the whole map; the problem has the part of it that the prior allows.
     """
     images = problem.photo.images
     workers = means.workers
     # idle cores prepare the images that later steps need
     with workers.beside(images.middle, images.fine, images.full, problem.colors):
-        asked, candidates = make_attempts(plan_attempts(problem), means)
-        candidates += search_beyond_prior(asked, scan_map, means)
+        searched, candidates = make_attempts(plan_attempts(problem), means)
+        candidates += search_beyond_prior(searched, scan_map, means)
         with means.watch.stage("refine"):
-            refined = refine_best(asked, candidates, workers)
-            means.trace.note("refined", partial(describe_selection, asked, refined))
-            return fit_camera(asked, refined, means)
+            refined = refine_best(searched, candidates, workers)
+            means.trace.note("refined", partial(describe_selection, searched, refined))
+            return fit_camera(searched, refined, means)
 
 
 def make_attempts(
     planned: Sequence[tuple[Problem, Attempt]], means: Means
 ) -> tuple[Problem, list[Candidate]]:
-    """Make attempts until one is sure; return the problem of the last one, and what all have found."""
+    """Make attempts until one finds a sure pose; return the last one's problem, and all candidates."""
     candidates: list[Candidate] = []
-    for asked, attempt in planned:
-        candidates, is_enough = attempt(asked, candidates, means)
-        means.trace.note("attempt", partial(describe_attempt, asked, attempt, candidates, is_enough))
+    for problem, attempt in planned:
+        candidates, is_enough = attempt(problem, candidates, means)
+        means.trace.note("attempt", partial(describe_attempt, problem, attempt, candidates, is_enough))
         if is_enough:
             break
-    return asked, candidates
+    return problem, candidates
 
 
 def describe_attempt(
     problem: Problem, attempt: Attempt, candidates: Sequence[Candidate], is_enough: bool
 ) -> Step:
-    """Describe what was found after an attempt."""
+    """Describe an attempt, and all candidates that are known after it."""
     how = attempt.keywords if isinstance(attempt, partial) else {}
     function = attempt.func if isinstance(attempt, partial) else attempt
     return {
@@ -135,9 +135,10 @@ def find_by_edges(problem: Problem, scan_map: ScanMap, means: Means) -> Found:
 
 
 def fit_camera(problem: Problem, found: Selection, means: Means) -> Found:
-    """Compare what a photo says of its geometry with the scan, and refine the poses, unless they are faint.
+    """Compare the geometry that a photo claims with the scan, and refine the poses by the geometry found.
 
-    Photos of several cameras are taken as they say; so are edges, which lie beside those of the scan.
+    Nothing is compared if the poses are faint, for photos of several cameras, and for panoramas in scans
+    without colours, as a photo's edges do not lie exactly on those of the scan.
     """
     if is_faint(problem.profile, found):
         return Found(problem, found, None)
@@ -154,7 +155,7 @@ def has_guessed_focal(panorama: Panorama) -> bool:
 
 
 def list_guessed(panorama: Panorama) -> list[Panorama]:
-    """Return a photo with several focal lengths around a guess; as it is if its own is none."""
+    """Return a photo with each of several focal lengths around its own, if that is a guess; else as it is."""
     if not has_guessed_focal(panorama):
         return [panorama]
     camera = panorama.cameras[0].camera
@@ -175,7 +176,10 @@ def localize_guessed(
 
 
 def is_same_but_for_focal(one: Result, pose: Pose, focal: FocalLength | None) -> bool:
-    """Return True if a pose is a result's up to a move along the view that their focal lengths explain."""
+    """Return True if a pose is that of a result, but for a move along the direction of view.
+
+    The difference of the focal lengths with which they were found must explain the move.
+    """
     own = one.best_pose
     if own is None:
         return False

@@ -22,10 +22,10 @@ from ..system.kernels.jit import F0, kernel
 from ..views.candidate_views import WIDE_RINGS
 from .correlation import VIEWS_A_PRODUCT, Samples, correlate_pairs, masked_correlation, weigh_by_area
 
-ROTATIONS_AT_ONCE = 256  # that a thread averages
+ROTATIONS_AT_ONCE = 256  # rotations that a thread averages at a time
 SCORES_AT_ONCE = 1 << 23  # 32 MB
 LOWEST = np.float32(-np.inf)
-TURNED_BYTES = 4 * 16  # of a rotation, a cell: channels, validity, energy, and what they are made from
+TURNED_BYTES = 4 * 16  # a cell and rotation: channels, validity, energy, and the arrays they are made from
 MIN_STARTS = 1000
 PITCHES_DEG = (-27.0, -18.0, -9.0, 0.0, 9.0, 18.0, 27.0)  # of a camera held about level
 NUM_LEVEL_YAWS = 40
@@ -90,7 +90,7 @@ def widen_samples(samples: Samples, validity: Samples, workers: Workers) -> tupl
 
 @dataclass(frozen=True)
 class Starts:
-    """Poses in arrays, best first, and the candidate on whose view each descends."""
+    """Poses in arrays, best first, each with the candidate position on whose view it descends."""
 
     R_cam_from_map: Array  # (n, 3, 3)
     center_map: Array  # (n, 3) [m]
@@ -116,8 +116,8 @@ def best_poses_wide(
 ) -> tuple[Int64s, Int64s, Samples]:
     """Return the best `pool` poses by the masked correlation of wide views with the averaged panorama.
 
-    The result is as of `best_poses`. `num_views` candidates are scored at a time: the scores of a campus in
-    all rotations would take a gigabyte.
+    It returns what `best_poses` returns. `num_views` candidates are scored at a time: the scores of a campus
+    in all rotations would take a gigabyte.
     """
     area = wider_cells(WIDE_RINGS)[1]
     wide_samples, wide_validity = widen_samples(samples, validity, workers)
@@ -175,8 +175,8 @@ def best_poses(scores: Samples, pool: int, least: np.float32 = LOWEST) -> tuple[
 def search_poses(problem: Problem, tilts: Tilts, effort: Effort, workers: Workers) -> Starts:
     """Search the sparse candidates with all rotations in two stages; return the distinct best.
 
-    The first scores wide cells of all, by matrix products, the second the search grid's cells of the best
-    poses. Profiles may do without it: the means are subtracted in the first then.
+    The first stage scores all poses on wide cells, by matrix products; the second scores the best of them on
+    the cells of the search grid. Some profiles skip the second, and subtract the means in the first.
     """
     m = problem.scan_map
     rotations = list_rotations(problem, tilts, effort)
@@ -208,7 +208,7 @@ def search_poses(problem: Problem, tilts: Tilts, effort: Effort, workers: Worker
 
 
 def thin_starts(method: Method, num_candidates: int, most: int) -> int:
-    """Return from how many poses descents begin, where there are few candidates from fewer."""
+    """Return the number of poses from which descents begin: fewer if there are few candidates."""
     return min(max(num_candidates // method.candidates_per_start, MIN_STARTS), most)
 
 

@@ -21,9 +21,10 @@ from .attempts import FIRST_BEAM
 from .beam import refine_starts, score_starts
 from .search import search_poses
 
-NUM_TILTS = 3  # that are searched in full, at most
-# of what the scan shows at a pose, that it shows at a copy of that place too; chosen between panoramas of
-# three photorealistic buildings (at most 0.42) and made racks and hotel rooms (0.54 to 0.84)
+NUM_TILTS = 3  # tilts that are searched in full, at most
+# fraction of what the scan shows at a pose that it must show at a copy of the place too; chosen between the
+# poses of panoramas of three photorealistic buildings (at most 0.42) and those in racks and hotel rooms that
+# were made by a program (0.54 to 0.84)
 LEAST_ALIKE = 0.5
 LEVEL_SINE = np.sin(np.radians(20.0))  # of the angle of level lines to the horizon, at most
 
@@ -35,7 +36,10 @@ def is_tilt_known(problem: Problem) -> bool:
 
 
 def is_explained_by_edges(found: Selection, searched: Problem) -> bool:
-    """Return True if a pose explains a photo by its edges: one alone, unless lines lie along the walls."""
+    """Return True if a pose explains a photo by its edges.
+
+    Only one pose may do so, unless the rotations were limited to lines along the walls.
+    """
     is_alone = found.margin > searched.method.clear_margin or searched.rotations is not None
     return found.best.score > searched.profile.clear_score and is_alone
 
@@ -55,7 +59,7 @@ def align_lines(yaw_of_walls: float | None, axes: Sequence[Array], R_cam_from_le
 
 
 def align_level(problem: Problem, axes: Sequence[Array], yaw_of_walls: float | None) -> Problem:
-    """Return the problem at the camera's tilt: level unless the photo says another."""
+    """Return the problem at the camera's tilt: level unless the photo's file gives another."""
     rotations = align_lines(yaw_of_walls, axes, problem.photo.R_cam_from_level)
     return replace(problem, gravity="known", rotations=rotations)
 
@@ -69,7 +73,7 @@ def find_tilts(
 ) -> list[Problem]:
     """Return problems with one of the axes (3,) of the photo's lines as vertical, those that fit best.
 
-    In a building the vertical is one of six directions of lines. Each is searched briefly.
+    In a building, the vertical is one of six directions of lines. Each axis is tried by a brief search.
     """
     effort = effort.brief()
     tried = []
@@ -87,9 +91,9 @@ def find_tilts(
 
 
 def find_alike(problem: Problem, pose: Pose, effort: Effort, workers: Workers) -> list[Pose]:
-    """Return poses elsewhere at which the scan looks as at a pose, as between racks of one kind.
+    """Return poses elsewhere at which the scan looks as it does at a pose, as between racks of one kind.
 
-    The edges of the scan seen from the pose are searched in the scan, as if they were a photo.
+    The edges of the scan that are seen from the pose are localized in the scan, as if they were a photo.
     """
     drawn = draw_scan(problem, pose, effort.num_yaws)
     starts = search_poses(drawn, "known", effort.brief(), workers)
@@ -104,14 +108,14 @@ def find_alike(problem: Problem, pose: Pose, effort: Effort, workers: Workers) -
 
 
 def draw_scan(problem: Problem, pose: Pose, num_yaws: int) -> Problem:
-    """Return a problem in which the scan as seen from a pose takes the photo's place, at its tilt."""
+    """Return a problem whose photo is the scan as seen from a pose, to be searched at the pose's tilt."""
     sums = problem.averages_at(pose, round_position(pose), FINE_VIEW)
-    shown = problem.photo.panorama.is_valid
-    rays = pixel_rays(shown.shape[1]) @ pose.R_cam_from_world
-    cells = find_cell(rays.reshape(-1, 3).astype(np.float32), FINE_VIEW.num_rings).reshape(shown.shape)
+    is_shown = problem.photo.panorama.is_valid
+    rays = pixel_rays(is_shown.shape[1]) @ pose.R_cam_from_world
+    cells = find_cell(rays.reshape(-1, 3).astype(np.float32), FINE_VIEW.num_rings).reshape(is_shown.shape)
     counts = sums[cells, 6:7]
     rgb = np.rint(255.0 * sums[cells, 3:6] / np.maximum(counts, 1.0)).astype(np.uint8)
-    is_valid = shown & (counts[..., 0] > 0.0)
+    is_valid = is_shown & (counts[..., 0] > 0.0)
     photo = problem.photo.take(replace(problem.photo.panorama, rgb=rgb, is_valid=is_valid))
     return replace(
         problem,
