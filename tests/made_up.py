@@ -49,7 +49,7 @@ def move(candidate, metres, score=None):
     pose = replace(candidate.pose, center_world=candidate.pose.center_world + np.array([metres, 0.0, 0.0]))
     if score is None:
         return replace(candidate, pose=pose)
-    return replace(candidate, pose=pose, score=score, seen=seen(score))
+    return replace(candidate, pose=pose, score=score, comparison=seen(score))
 
 
 def place(pose):

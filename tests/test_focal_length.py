@@ -18,7 +18,7 @@ from piccolo.evidence.self_calibration import LensEstimate
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import Selection
-from piccolo.judge.claim import Told
+from piccolo.judge.claim import PictureCorrections
 from piccolo.judge.result_parts import Alternative, Evidence, FocalLength
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import run as module
@@ -135,7 +135,7 @@ def test_each_source_of_a_focal_length_has_its_deviation():
 
 def _estimate(values, information):
     """What independent blocks without number tell of a lens."""
-    return LensEstimate(Told(values, information, np.zeros((0, 5, 5))), np.ones((6, 5)))
+    return LensEstimate(PictureCorrections(values, information, np.zeros((0, 5, 5))), np.ones((6, 5)))
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(minimum, shar
     assert fit.change[0] / minimum == pytest.approx(share, abs=0.02)
     assert fit.deviation == pytest.approx(std, rel=0.03)
     assert (fit.of_difference[0, 0] > 1e-6) == (minimum == 0.021)  # beyond two they are in the deviation
-    nothing = _estimate(found.told.values, np.zeros((5, 5)))
+    nothing = _estimate(found.by_picture.values, np.zeros((5, 5)))
     open_fit = focal.weigh_claim(panorama.focal_prior, camera, nothing, nothing)
     assert (open_fit.change[0], open_fit.deviation, open_fit.conflict) == (0.0, pytest.approx(0.01), 0.0)
 

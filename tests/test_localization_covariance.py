@@ -275,7 +275,7 @@ def test_a_view_from_nearby_tells_the_covariance_without_what_occluders_hide(fou
     rgb[120:180, 100:180] = np.random.default_rng(0).integers(0, 256, (60, 80, 3))
     hidden = rooms.ask(as_panorama(rgb), prepared.scan_map, rooms.KNOWN)
     candidate = examine(hidden, pose)
-    shown = covariance.mask_occluders(hidden, candidate.seen)
+    shown = covariance.mask_occluders(hidden, candidate.comparison)
     assert shown.photo is not hidden.photo
     masked = covariance.estimate_covariance(hidden, candidate, WORKERS)
     unasked = Unoccluded(shown.contradicts, Photo(shown.photo.panorama))

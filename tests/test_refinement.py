@@ -148,7 +148,7 @@ def test_occluders_are_masked_again_where_that_gains(monkeypatch, is_masked, sco
 
     for name in ("climb_masked", "climb_whole"):
         monkeypatch.setattr(ladder, name, climb)
-    start = replace(make_candidate(0.0, scores[0]), seen=seen)
+    start = replace(make_candidate(0.0, scores[0]), comparison=seen)
     found = ladder.climb_unoccluded(replace(PROBLEM, photo=whole), start, ALONE)
     assert made == ["masked" if is_masked else whole] * rounds
     assert found.unoccluded.photo == made[-1]
@@ -185,7 +185,7 @@ def test_points_are_taken_again_from_where_the_pose_is_until_it_hardly_moves(set
 
     views = SimpleNamespace(points=points, averages=problem.views.averages)
     asked = replace(problem, views=views)
-    shown = ladder.mask_occluders(problem, start.seen)
+    shown = ladder.mask_occluders(problem, start.comparison)
     begin = replace(start, unoccluded=shown)
     near = ladder.converge(asked, begin, LAST._replace(rounds=Rounds(6, np.inf)), ALONE)
     assert places == [round_position(start.pose)]

@@ -54,7 +54,7 @@ def last_way(monkeypatch):
     def note(name):
         def refine(problem, candidate, workers):
             made.append((name, place(candidate.pose)))
-            explained = replace(candidate, score=candidate.seen.score)
+            explained = replace(candidate, score=candidate.comparison.score)
             return ends.get(made[-1], explained)
 
         return refine
@@ -154,7 +154,7 @@ def test_of_poses_that_beat_each_other_in_turn_the_one_beaten_least_is_best():
             return ratios[self.place, other.place]
 
     for order in ((0.0, 3.0, 6.0), (6.0, 0.0, 3.0), (3.0, 6.0, 0.0)):
-        given = make_selection(*(replace(make_candidate(x, 0.5, 20), seen=Seen(x)) for x in order))
+        given = make_selection(*(replace(make_candidate(x, 0.5, 20), comparison=Seen(x)) for x in order))
         selected = select(WHOLE, given)
         assert places(selected.candidates) == [6.0, 0.0, 3.0]
         assert selected.rival_ratio == pytest.approx(1.0 / 0.9)

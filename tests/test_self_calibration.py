@@ -17,7 +17,7 @@ from piccolo.evidence.self_calibration import FreeEnd, LensEstimate, displace_bl
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.pose_gaussian import probability_of_ball
 from piccolo.geometry.sphere import compute_pixels
-from piccolo.judge.claim import Claim, Told, marginal
+from piccolo.judge.claim import Claim, PictureCorrections, marginal
 from piccolo.judge.result import Result
 from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.optimize.corrected_equations import sum_free_equations
@@ -187,7 +187,7 @@ def _claim(count=2):
 
 def _tell(values, information):
     """What independent blocks without number tell."""
-    return Told(values, information, np.zeros((0, len(values), len(values))))
+    return PictureCorrections(values, information, np.zeros((0, len(values), len(values))))
 
 
 def test_what_few_blocks_tell_contradicts_a_claim_less():
@@ -196,12 +196,12 @@ def test_what_few_blocks_tell_contradicts_a_claim_less():
     information = np.array([[1.0 / 0.1**2]])
     off = np.array([4.0 * math.hypot(0.1, 0.01)])
     for num_blocks in (3, 8, 1000):
-        told = Told(off, information, np.ones((num_blocks, 1, 1)))
+        by_picture = PictureCorrections(off, information, np.ones((num_blocks, 1, 1)))
         chance = 2.0 * stats.t.sf(4.0, num_blocks)
-        assert claim.conflict(told) == pytest.approx(stats.norm.isf(0.5 * chance), rel=0.03)
-    uneven = Told(off, information, np.array([1.0, *[1e-6] * 20])[:, None, None])
+        assert claim.conflict(by_picture) == pytest.approx(stats.norm.isf(0.5 * chance), rel=0.03)
+    uneven = PictureCorrections(off, information, np.array([1.0, *[1e-6] * 20])[:, None, None])
     assert claim.conflict(uneven) < 2.0
-    exact = Told(np.array([0.04]), np.array([[1.0 / 0.001**2]]), np.ones((3, 1, 1)))
+    exact = PictureCorrections(np.array([0.04]), np.array([[1.0 / 0.001**2]]), np.ones((3, 1, 1)))
     assert claim.conflict(exact) == pytest.approx(4.0, rel=0.02)
 
 
@@ -213,9 +213,9 @@ def test_a_claim_is_doubted_as_far_as_the_picture_contradicts_it():
     for off in (0.0, 0.03, -0.06):
         odds = 0.02 / 0.98 * math.sqrt(spread / (spread + 0.01))
         odds *= math.exp(0.5 * off**2 * (1.0 / spread - 1.0 / (spread + 0.01)))
-        told = _tell(np.array([off]), information)
-        assert one.doubt(told) == pytest.approx(odds / (1.0 + odds))
-        assert one.conflict(told) == pytest.approx(abs(off) / math.sqrt(spread))
+        by_picture = _tell(np.array([off]), information)
+        assert one.doubt(by_picture) == pytest.approx(odds / (1.0 + odds))
+        assert one.conflict(by_picture) == pytest.approx(abs(off) / math.sqrt(spread))
     two = _claim()
     together = np.linalg.inv(0.02**2 * np.array([[1.0, 0.9], [0.9, 1.0]]))
     alike = two.conflict(_tell(np.array([0.05, 0.05]), together))
@@ -293,10 +293,10 @@ def test_a_claim_that_holds_widens_a_pose_by_what_picture_and_claim_leave_open()
     camera = whole_sphere(512, 256)
     held = SphereFit(camera, sharp, is_claimed=True)
     assert math.sqrt(held.pose_covariance[5, 5]) == pytest.approx(4e-4, rel=0.01)
-    blind = held._replace(estimate=sharp._replace(told=_tell(np.zeros(3), np.zeros((3, 3)))))
+    blind = held._replace(estimate=sharp._replace(by_picture=_tell(np.zeros(3), np.zeros((3, 3)))))
     assert math.sqrt(blind.pose_covariance[5, 5]) == pytest.approx(4.0 * CLAIM.deviations[2], rel=0.01)
-    told = sharp.told._replace(values=np.array([0.0, 0.0, 0.002]))
-    off = held._replace(estimate=sharp._replace(told=told))
+    by_picture = sharp.by_picture._replace(values=np.array([0.0, 0.0, 0.002]))
+    off = held._replace(estimate=sharp._replace(by_picture=by_picture))
     assert math.sqrt(off.pose_covariance[5, 5]) == pytest.approx(0.008, rel=0.03)
     assert count_deviations(off.estimate) == pytest.approx(0.002 / CLAIM.deviations[2], rel=0.01)
 

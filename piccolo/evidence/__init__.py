@@ -1,1 +1,1 @@
-"""The evidence for and against a pose: made here, complete, for those who decide."""
+"""The evidence for and against a pose: all of it is computed here, and the judge decides by it."""

@@ -1,9 +1,10 @@
 """The geometry that a panorama claims, compared with the scan: how much of the sphere it shows.
 
 A picture twice as wide as high claims to show 360 by 180 degrees with the horizon in the middle. If rows were
-cut off before it was resized, it does not: walls, floor and ceiling then look nearer or farther together, and
-a pose a few decimetres off fits best. So width, height and horizon descend with the pose. They are taken as
-claimed as long as the photo agrees; else as found, from several starts, and the photo is projected again.
+cut off before it was resized, the claim is wrong: walls, floor and ceiling then look nearer or farther
+together, and a pose a few decimetres off fits best. So width, height and horizon are optimised together with
+the pose. The claimed values are used as long as the photo agrees with them. Else they are searched from
+several starts, and the photo is projected again with the values found.
 """
 
 import itertools
@@ -30,14 +31,14 @@ CLAIM = Claim(
     wrong_deviations=np.array([0.05, 0.1, 0.1]),  # chosen
     wrong_shares=np.array([0.005, 0.005, 0.005]),  # chosen
 )
-SPHERE_CURVATURE = 0.5  # as of `self_calibration`, but of whole panoramas, whose loss flattens less
-BY_CHANCE = 12.0  # squared deviations of the corrections together that a right claim may have
+SPHERE_CURVATURE = 0.5  # CURVATURE of self_calibration for whole panoramas, whose loss flattens less
+BY_CHANCE = 12.0  # sum of the squared deviations of all corrections that a right claim may have by chance
 MOST_SPHERE_CHANGE = np.array([0.2, 0.6, 0.4])  # corrections that are searched
 ANY = np.full(3, np.inf)
 HEIGHT_STARTS = -np.log([1.0, 0.9, 0.8, 0.72])  # corrections of the height from which descents begin
-LEAST_CUT = 0.1  # of the height, for which the horizons of starts are spread
-HORIZONS = (-1.0, -0.5, 0.0, 0.5, 1.0)  # where all, three quarters or half is cut off at one end
-NUM_ENDS = 3  # of the descents on coarse cells, that go on
+LEAST_CUT = 0.1  # part of the height, at least, by whose cut the horizons of starts are spread
+HORIZONS = (-1.0, -0.5, 0.0, 0.5, 1.0)  # of starts: all, three quarters or half of the cut is at one end
+NUM_ENDS = 3  # of the descents on coarse cells: the best, which go on on finer ones
 COARSE_LIMITS = Limits(1.2, 10, 5e-3)
 MIDDLE_LIMITS = Limits(1.2, 12, 1e-3)
 FINE_LIMITS = Limits(1.0, 15, 1e-3)
@@ -47,25 +48,25 @@ class SphereFit(NamedTuple):
     """The geometry of a panorama, with its errors."""
 
     camera: Camera  # as found, or as claimed
-    estimate: LensEstimate  # corrections of that by the photo and the scan alone
+    estimate: LensEstimate  # corrections of this camera by the photo and the scan alone
     is_claimed: bool  # the camera is as the picture claims
     conflict: float = 0.0  # deviations between claim and picture, where what is claimed is used
     doubt: float = 0.0  # probability that the claim is wrong and has pulled the pose along
 
     @property
     def covariance(self) -> Array:
-        """Covariance (3, 3) of the corrections: also by the claim, where that is used."""
+        """Covariance (3, 3) of the corrections, with the claim as further evidence if it is used."""
         precision = np.diag(CLAIM.precision) if self.is_claimed else 1e-6 * np.eye(3)
-        return np.asarray(np.linalg.inv(self.estimate.told.information + precision))
+        return np.asarray(np.linalg.inv(self.estimate.by_picture.information + precision))
 
     @property
     def pose_covariance(self) -> Array:
         """Covariance (6, 6) that the geometry adds to a pose: rotation, then centre in the map."""
         covariance = self.covariance
-        values = self.estimate.told.values
-        information = self.estimate.told.information
+        values = self.estimate.by_picture.values
+        information = self.estimate.by_picture.information
         motion = self.estimate.motion
-        off = covariance @ information @ values  # which is not applied
+        off = covariance @ information @ values  # the photo's correction, which is not applied
         beyond = max(1.0 - BY_CHANCE / max(float(values @ information @ values), BY_CHANCE), 0.0)
         return np.asarray(motion @ (covariance + beyond * np.outer(off, off)) @ motion.T)
 
@@ -92,9 +93,9 @@ def make_freedom(camera: Camera) -> Freedom:
 
 
 def count_deviations(estimate: LensEstimate) -> float:
-    """Return how many deviations the most contradicted correction is from what is claimed."""
-    variances = np.diag(invert(estimate.told.information))
-    return float((np.abs(estimate.told.values) / np.sqrt(CLAIM.deviations**2 + variances)).max())
+    """Return by how many deviations the claim is wrong, in the correction that contradicts it most."""
+    variances = np.diag(invert(estimate.by_picture.information))
+    return float((np.abs(estimate.by_picture.values) / np.sqrt(CLAIM.deviations**2 + variances)).max())
 
 
 def search_geometry(problem: Problem, pose: Pose, claimed: Camera, workers: Workers) -> FreeEnd:

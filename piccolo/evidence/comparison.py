@@ -150,7 +150,7 @@ def compare(
 ) -> Comparison:
     """Compare the scan at a pose with the photo, by blocks, by default on fine cells.
 
-    `seen_from` is a pose so near that it sees the same, whose view may be known.
+    `seen_from` is a pose so near that the same is seen from there; its view may have been drawn already.
     """
     view = config.arrays
     place = round_position(seen_from or pose)
@@ -179,9 +179,9 @@ def compare(
 
 
 def mask_occluders(problem: Problem, seen: Comparison, known: Unoccluded | None = None) -> Unoccluded:
-    """Return the photo without the blocks that contradict the scan at a pose; all of it if there are none.
+    """Return the photo without the blocks that contradict the scan at a pose; the whole if none does.
 
-    `known` is a photo that was masked at a pose nearby, perhaps in the same way.
+    `known` is the photo as masked at a pose nearby: it is returned if the same blocks are masked there.
     """
     if not seen.contradicts.any():
         return Unoccluded(b"", problem.photo)

@@ -1,4 +1,4 @@
-"""Poses that contradict what was told of them."""
+"""Contradictions between a pose and the prior knowledge of it."""
 
 import math
 
@@ -34,7 +34,7 @@ def contradictions(scan_map: ScanMap, pose: Pose, prior: Prior) -> tuple[Contrad
 
 
 def find_contradicted_heading(pose_world: Pose, prior: Prior) -> list[Contradiction]:
-    """Return how a pose contradicts a heading; cameras looking steeply up or down have none."""
+    """Return how a pose contradicts a given heading; a camera that looks steeply up or down has none."""
     forward = pose_world.R_cam_from_world[0]
     if prior.heading_deg is None or math.hypot(forward[0], forward[1]) < STEEP:
         return []

@@ -30,20 +30,20 @@ from .scan_errors import layer_covariance, scan_covariance
 from .verification import draw_near, place_by_matches
 
 ERROR_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
-LEAST_INFORMATION = 1e-12  # of the greatest, in any direction
-LEAST_BLOCKS = 13  # fewer do not tell six dimensions
+LEAST_INFORMATION = 1e-12  # in any direction, as a fraction of that in the best-known direction
+LEAST_BLOCKS = 13  # with fewer, errors in six dimensions can't be estimated
 ONE_BLOCK = 1.001  # above 1, so that one block may hold all information
-UNCALIBRATED = 0.005  # deviation of the focal length's logarithm: a calibration is better known
-LEAST_STEP_RANGE = 0.005 / math.radians(0.1)  # [m] for moves of differences: shorter ones are lost in noise
+UNCALIBRATED = 0.005  # deviation of a focal length's logarithm from which the camera is not calibrated
+LEAST_STEP_RANGE = 0.005 / math.radians(0.1)  # [m] least range: steps for nearer points would drown in noise
 LEAST_ACTING = 0.25  # [m] distance of points that count: nearer ones are noise, as cameras stand clear
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
 TINY_VARIANCE = 1e-12  # [rad^2, m^2] least variance of errors of one photo alone
 COVARIANCE_SCALE = LAST.limits.loss_scale * LEVELS_PER_UNIT
 # normals (9, 3), in the camera's frame, of planes between halves: the seam of two lenses may have any azimuth
 NORMALS = np.array([*(yaw_rotation(k * math.pi / 8.0)[0] for k in range(8)), (0.0, 0.0, 1.0)])
-SEAMS = (0.25, 0.5, 0.75)  # of the points, on one side of a plane between parts of the scan
-SEAM_SCORE = 4.5  # of parts; single scans have more in a fifth of photos
-NUM_TRIED_PLANES = 2  # planes
+SEAMS = (0.25, 0.5, 0.75)  # share of the points on one side of a plane between parts of the scan
+SEAM_SCORE = 4.5  # least score of parts that disagree; in a single scan, a fifth of the photos have more
+NUM_TRIED_PLANES = 2  # planes whose halves descend by themselves
 HALF_LIMITS = (15, 1e-5)  # iterations of a half's descent, and tolerance [rad + m]
 
 
@@ -85,15 +85,15 @@ def remove_hidden(points: Cells, is_valid: Mask, pose: Pose) -> Cells:
 
 
 def compute_median_range(points: Cells) -> float:
-    """Return the median distance [m] of points from the centre around which they are."""
+    """Return the median distance [m] of points from the camera that they surround."""
     return float(np.median(np.linalg.norm(points.offsets, axis=0)))
 
 
 def compute_acting_range(points: Cells) -> float:
-    """Return the distance [m] at which a move displaces what is seen as much as it does points in the mean.
+    """Return the distance [m] of a point that a move displaces in the picture as much as points in the mean.
 
-    It is that of the mean square of inverse distances from the centre around which the points are: near ones
-    tell moves from turns, and are displaced most by errors of surfaces.
+    Its inverse is the root mean square of the points' inverse distances from the camera: near points
+    distinguish moves from turns, and errors of surfaces displace them most.
     """
     squares = np.square(points.offsets).sum(axis=0, dtype=np.float64)
     return float(np.mean(1.0 / np.maximum(squares, LEAST_ACTING**2)) ** -0.5)
@@ -102,7 +102,8 @@ def compute_acting_range(points: Cells) -> float:
 def compute_std_of_fit(covariance: Array, acting_range: float) -> float:
     """Return the largest deviation of a position by its covariance (6, 6), as an angle [rad].
 
-    It is seen from `acting_range` [m]; nearer ones count as in a large room.
+    It is the angle under which the deviation is seen from `acting_range` [m], or from the far end of a large
+    room if that range is shorter.
     """
     return largest_std(covariance) / max(acting_range, ROOM_RANGE)
 
@@ -111,7 +112,8 @@ def compute_hessian(problem: ChannelProblem, pose: Pose, turn: float, median_ran
     """Return the Hessian (6, 6) of the robust loss, by differences over steps as large as errors are.
 
     The Gauss-Newton matrix ignores that the loss flattens, and would make deviations several times too small.
-    The points of the problem are around the pose; the median of their ranges [m] makes moves of turns [rad].
+    The points of the problem surround the pose. Steps of the position are `turn` [rad] times their median
+    range [m].
     """
     sizes = np.repeat([turn, turn * max(median_range, LEAST_STEP_RANGE)], 3)
     ends = [step(pose, sign * delta) for delta in np.diag(sizes) for sign in (1.0, -1.0)]
@@ -181,9 +183,9 @@ def few_blocks_factor(num_blocks: int) -> float:
 
 
 def merge_covariances(found: Sequence[Array]) -> Array:
-    """Return the covariance (6, 6) that has the mean information of some.
+    """Return the covariance (6, 6) whose information is the mean of that of several.
 
-    The least of them may be so by chance, if few blocks tell it.
+    Estimated from few blocks, the least of the covariances may be so small by chance.
     """
     information, axes = np.linalg.eigh(np.mean(np.linalg.inv(found), axis=0))
     return np.asarray((axes / np.maximum(information, LEAST_INFORMATION * information[-1])) @ axes.T)
@@ -197,11 +199,11 @@ def make_problem(points: Cells, image: Texels) -> ChannelProblem:
 
 
 def score_halves(sums: Array, is_ahead: Mask) -> Array:
-    """Score (S,) if halves ask for poses of their own, from blocks' sums (B, 29); 1 in the mean by chance.
+    """Score (S,) how much two halves disagree about a pose, by blocks' sums (B, 29); by chance 1 in the mean.
 
-    `is_ahead` (S, B) tells the half of each block. The score is g^T A^-1 g of both halves' gradients at the
-    pose of all, as in the test of Rao (1948), over its mean by the gradients of blocks; 0 where a half has
-    too few blocks.
+    `is_ahead` (S, B) is True for the blocks of one half. The score is the sum of g^T A^-1 g over both halves,
+    g their gradients at the pose of all points, as in the test of Rao (1948), divided by what is expected of
+    it from the gradients of single blocks; 0 where a half has too few blocks.
     """
     gradients = sums[:, GRADIENT:MATRIX]
     matrices = fill_symmetric(sums[:, MATRIX:])
@@ -220,10 +222,10 @@ def score_halves(sums: Array, is_ahead: Mask) -> Array:
 def descend_half(points: Cells, images: Sequence[Texels], pose: Pose) -> tuple[float, Array]:
     """Descend from a pose on points of one half; return the loss, and the step (6,) as of `pose.step`.
 
-    It descends in the images from coarse to fine, and in the finest alone; the lower end counts. The finest
-    alone can't correct degrees, and a coarse one misleads in flat places.
+    One descent goes through the images from coarse to fine, another uses the finest alone; the one with the
+    lower loss counts. The finest alone can't correct degrees, and a coarse one misleads in flat places.
     """
-    start = Pose(pose.R_cam_from_world, np.zeros(3))  # around which the points are
+    start = Pose(pose.R_cam_from_world, np.zeros(3))  # the points' offsets are from its centre
     ends = []
     for way in (images, images[-1:]):
         R = start.R_cam_from_world.copy()
@@ -244,12 +246,13 @@ def split_by_planes(points: Cells, begins: Int64s) -> Mask:
 def disagreement(
     photo: PhotoImages, points: Cells, pose: Pose, covariance: Array, least: float, workers: Workers
 ) -> Array:
-    """Return what parts that disagree about the pose of a whole photo add to its `covariance` (6, 6).
+    """Return the covariance (6, 6) to be added to that of a whole photo if its parts disagree about the pose.
 
-    Lenses stitched with an error and scans out of shape leave a pose between those of the halves, far from
-    both. Added are the covariance and the mean square of the steps to theirs. Parts of a scan that were moved
-    against each other may lie beyond any plane, and a pose is right by one of them: the product of the steps
-    is added in all directions. Both are less for scores near chance, halves' near `least`.
+    Lenses stitched with an error and scans out of shape leave a pose between those of two halves of the
+    photo, far from both. For these, the covariance and the mean square of the steps to the halves' poses are
+    added. Parts of a scan that were moved against each other may lie on the two sides of any plane, and the
+    pose is right by one of the parts: the product of the two steps is added in all directions. Both terms
+    vanish as the score falls to that of chance: `least` for halves of the photo, SEAM_SCORE for the scan's.
     """
     points, begins = sort_by_block(points)
     blocks_map = make_grid(ERROR_RINGS).directions[: len(begins) - 1]
@@ -281,10 +284,10 @@ def disagreement(
 def compute_covariance(photo: PhotoImages, points: Cells, pose: Pose, profile: Profile) -> Array | None:
     """Return the covariance (6, 6) [rad, m] in the camera's frame.
 
-    Noise and stitching roughen the loss in the finest image; the next one is smoother. Those that are not too
-    rough count alike; if both are, a third is used. `photo` may be without occluders. If it shows a part of
-    the sphere even with them, the covariance is larger, as few blocks tell it (`few_blocks_factor`). The
-    points are around the pose.
+    Noise and stitching roughen the loss in the finest image; in the next one it is smoother. The covariances
+    by both images are averaged, without one whose loss is too rough; if both are too rough, a third image is
+    used. Occluders may be masked in `photo`. If the unmasked photo shows a part of the sphere only, the
+    covariance is enlarged, as it rests on few blocks (`few_blocks_factor`). The points surround the pose.
     """
     if points.offsets.shape[1] == 0:
         return None
@@ -305,7 +308,7 @@ def compute_covariance(photo: PhotoImages, points: Cells, pose: Pose, profile: P
 
 
 def split_errors(problem: Problem, pose: Pose, covariance: Array) -> PoseGaussian:
-    """Return a pose in the map with its covariance (6, 6), of which the errors of the scan are in common."""
+    """Return a pose in the map with its covariance (6, 6), split into errors of the scan and of the photo."""
     acting_range = compute_acting_range(problem.view_at(pose, "points"))
     common = scan_covariance(problem.scan_map, acting_range)
     common += layer_covariance(problem.scan_map, pose, acting_range)
@@ -314,10 +317,10 @@ def split_errors(problem: Problem, pose: Pose, covariance: Array) -> PoseGaussia
 
 
 def estimate_pose_errors(problem: Problem, candidate: Candidate, workers: Workers) -> Errors:
-    """Estimate the errors of a candidate's pose that a photo has by itself.
+    """Estimate the errors of a candidate's pose, by the photo alone.
 
-    The pose of a photo of a part of the sphere becomes the mean with that by its matches with the drawn scan,
-    unless that contradicts the prior. Where the points do not fix it, many matches do.
+    For a photo of a part of the sphere, the pose is averaged with the pose by its matches with the drawn
+    scan, unless the mean contradicts the prior. Where the points do not fix the pose, many matches do.
     """
     pose = candidate.pose
     errors = estimate_covariance(problem, candidate, workers)
@@ -345,21 +348,21 @@ def estimate_covariance(
 ) -> Errors:
     """Estimate the covariance of a candidate's pose in the map.
 
-    Photos have the errors of the scan in common, and of a scan without colours most errors: edges lie beside
-    those of the photos in the same way. `seen_from` is a pose so near that it sees the same points; of a
-    whole photo those behind occluders are then left out, which takes less time than to normalise a masked
-    photo.
+    Errors of the scan are common to all photos. In a scan without colours most errors are, as its edges are
+    displaced from those of all photos in the same way. `seen_from` is a pose so near that the same points are
+    seen from there; for a whole photo, the points behind occluders are then left out, which takes less time
+    than to mask the occluders and normalise the photo again.
     """
     pose = candidate.pose
     profile = problem.profile
     leaves_out = seen_from is not None and not profile.settles_near
-    masked = mask_occluders(problem, candidate.seen, candidate.unoccluded).photo
+    masked = mask_occluders(problem, candidate.comparison, candidate.unoccluded).photo
     if seen_from is None:
         points = problem.show(masked).view_at(pose, "points")
     else:
         points = problem.view_at(seen_from, "points")
     points = remove_poles(points.around(pose.center_world), pose)
-    if leaves_out and candidate.seen.contradicts.any():
+    if leaves_out and candidate.comparison.contradicts.any():
         points = remove_hidden(points, masked.panorama.is_valid, pose)
     photo = problem.photo if leaves_out else masked
     covariance = compute_covariance(photo, points, pose, profile)
@@ -372,7 +375,7 @@ def estimate_covariance(
     method = problem.method
     turn = (method.pixel_share if is_calibrated else method.uncalibrated_share) * problem.pixel
     move = turn * compute_median_range(points)
-    of_grid = np.diag(np.repeat([turn**2, move**2], 3))  # and of stitching, in all blocks
+    of_grid = np.diag(np.repeat([turn**2, move**2], 3))  # of pixels and stitching, alike in all blocks
     own = turn_positions(covariance, turned) + of_grid
     common = scan_covariance(problem.scan_map, acting_range)
     common = common + (1.0 - profile.own_share) * own

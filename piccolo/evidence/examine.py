@@ -1,4 +1,4 @@
-"""Make candidates with their evidence, complete for those who decide."""
+"""Make candidates, and complete their evidence for the judge."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,22 +16,22 @@ from .comparison import compare
 from .contradictions import contradictions
 from .verification import draw_near, verify
 
-DRAWN_CHANCE = 0.2  # correlation of a block's drawn edges that wrong poses reach: these are sharper
+DRAWN_CHANCE = 0.2  # correlation that wrong poses reach in a block of drawn edges, which are sharp
 
 
 def examine(problem: Problem, pose: Pose, near: Candidate | None = None) -> Candidate:
     """Compare the scan at a pose with the photo.
 
-    `near` is a candidate from which the pose was reached: what was drawn there serves here too, if it is near
-    enough.
+    `near` is a candidate from which the pose was reached. The scan that was drawn at that candidate is used
+    here too, if the two poses are near enough to each other.
     """
-    seen = compare(problem, pose)
-    found = check_prior(problem, Candidate(pose, seen.score, seen))
+    comparison = compare(problem, pose)
+    found = check_prior(problem, Candidate(pose, comparison.score, comparison))
     return found if near is None else replace(found, unoccluded=near.unoccluded, drawn=near.drawn)
 
 
 def check_prior(problem: Problem, candidate: Candidate) -> Candidate:
-    """Return a candidate with what was given that its pose contradicts."""
+    """Return a candidate with its contradictions to the prior."""
     found = contradictions(problem.scan_map, candidate.pose, problem.prior)
     return replace(candidate, against_prior=found)
 
@@ -44,8 +44,9 @@ def examine_each(problem: Problem, poses: Sequence[Pose], workers: Workers) -> l
 def count_agreeing(problem: Problem, candidate: Candidate, workers: Workers) -> Candidate:
     """Count the photo's features that agree with the scan drawn at a candidate.
 
-    They are those of the best pose near it. If that is farther away, as it may be where surfaces are far,
-    they are those that agree with the candidate itself, if there are more than by chance.
+    The features are counted that agree with the best pose near the candidate. If that pose is farther away,
+    as it may be where surfaces are far, those that agree with the candidate itself are counted, if they are
+    more than by chance.
     """
     drawn = draw_near(problem, candidate.pose, candidate.drawn, workers)
     found = verify(problem, candidate.pose, drawn.matches)
@@ -89,7 +90,8 @@ def complete(problem: Problem, found: Selection, workers: Workers) -> Selection:
 def choose(problem: Problem, found: Selection, workers: Workers) -> Selection:
     """Complete the evidence of ranked candidates, and select the best by all of it; the only way to select.
 
-    It is completed once more for who reads the evidence beside another best; nothing is selected again.
+    Beside another best, further candidates may be rivals: their evidence is then completed too, but nothing
+    is selected again.
     """
     chosen = select(problem.profile, complete(problem, found, workers))
     return complete(problem, chosen, workers)

@@ -1,9 +1,9 @@
 """The focal length of a photo, fitted with its pose to the scan and to prior knowledge.
 
-Pose and corrections of the lens (`self_calibration`) descend together. Where they end is what photo and scan
-tell; what was given is a claim with deviations of its own. The focal length (and k1, if a guessed camera has
-it) becomes the mean of both; the other corrections are not applied, as photos hardly tell them, but doubted.
-The covariance of the pose is marginal: it includes the errors of all.
+Pose and corrections of the lens (`self_calibration`) are optimised together. The optimum is the estimate by
+photo and scan; the given values are a claim with deviations of its own. The focal length (and k1, if a
+guessed camera has it) becomes the mean of estimate and claim. The other corrections are not applied, as a
+photo hardly determines them, but their errors count: the covariance of the pose is marginal over all of them.
 """
 
 import math
@@ -50,23 +50,23 @@ from .self_calibration import (
 from .verification import draw_near
 
 K1_DEVIATION = 0.05  # of k1 where the camera is a guess
-FITTED = [FOCAL, LENS.index("radial")]  # corrections that the camera takes; the others widen the covariance
+FITTED = [FOCAL, LENS.index("radial")]  # corrections that are applied; the others widen the covariance
 # deviations of the other corrections: of a calibration, and of a focal length alone
 CALIBRATED = (0.002, 0.003, 0.003, 0.005)
 NOT_CALIBRATED = (0.002, 0.005, 0.005, 0.008)
-OTHERS_WRONG = (0.05, 0.05, 0.05, 0.2)  # chosen: if they are wrong
-OTHERS_SHARES = (0.01, 0.01, 0.01, 0.01)  # chosen: of those that are wrong
-FIRST_CHANGES = (-0.1, 0.1)  # of the focal length's logarithm, from which first fits begin too
-CHANGES_BESIDE = (-0.03, 0.03)  # and from which descents begin once more: the loss is rough
-NUM_FOCAL_VIEWS = 2  # of the points, from where a descent ended
-FAR_AWAY = 0.5  # [m] from the pose, where a descent shows that the photo fixes none
-MOST_VARIANCE = 1.0  # of a focal length's logarithm: with more, the picture says nothing
+OTHERS_WRONG = (0.05, 0.05, 0.05, 0.2)  # chosen: deviations of the other corrections if the claim is wrong
+OTHERS_SHARES = (0.01, 0.01, 0.01, 0.01)  # chosen: shares of wrong claims
+FIRST_CHANGES = (-0.1, 0.1)  # of the focal length's logarithm: further starts of a first fit
+CHANGES_BESIDE = (-0.03, 0.03)  # of the logarithm at an end: starts of further descents, as the loss is rough
+NUM_FOCAL_VIEWS = 2  # times that a descent is repeated with the points seen from its end
+FAR_AWAY = 0.5  # [m] from the pose: a descent that ends farther away shows that the photo fixes no pose
+MOST_VARIANCE = 1.0  # of a focal length's logarithm: with more, the picture gives no estimate
 # deviations of corrections by which matches are fitted: of the focal length, and of all where descents begin
 FOCAL_WIDTHS = (0.5, *CALIBRATED)
 ALL_WIDTHS = (0.1, 0.05, 0.02, 0.02, 0.1)
-DISAGREE = 2.0  # deviations between picture and what was given, by which chance parts them in one of twenty
+DISAGREE = 2.0  # deviations between picture and claim; by chance, one photo in twenty has more
 AT_REST = 0.5  # deviations: a smaller change ends the fit
-LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
+LEAST_CHANGE = 5e-4  # of the focal length's logarithm: a smaller change ends the fit too
 EDGE_WIDTH = 17  # [px] of the sphere, around a point that shows nothing beyond the picture
 NEAR_LIMITS = Limits(1.0, 8, 1e-3)  # on fine cells, from another focal length
 CLOSE = Limits(0.7, 15, 1e-4)
@@ -78,14 +78,14 @@ class FocalFit(NamedTuple):
     change: Array  # (p,) logarithm of the focal length, and k1 if it is fitted: the likeliest
     covariance: Array  # (p, p) of these
     motion: Array  # (6, p) of a pose with it: rotation about the camera's axes [rad], centre in the map [m]
-    opinion: Opinion | None  # what the picture alone says; None if it says nothing
-    conflict: float  # deviations between that and what was given; 0 if it says nothing
-    doubt: float = 0.0  # as of FocalLength; none of what other photos of the camera tell
+    opinion: Opinion | None  # the estimate of the picture alone; None if it gives none
+    conflict: float  # deviations between that estimate and the claim; 0 without an estimate
+    doubt: float = 0.0  # as in FocalLength; 0 if the focal length was taken from other photos of the camera
     of_rest: Array | None = None  # (6, 6) what the other corrections add to the covariance of a pose
-    # (6, 6) what all corrections would add if nothing that was given holds; None of a guess
+    # (6, 6) what all corrections would add to it if the whole claim were wrong; None if it is a mere guess
     of_picture: Array | None = None
     worst_correction: str = "log_focal"  # the correction of LENS in which both differ most
-    # (6, 6) what is added to the errors that are told if picture and claim differ by more than both say
+    # (6, 6) added to the errors of the result if picture and claim differ by more than their deviations allow
     of_difference: Array | None = None
 
     @property
@@ -124,10 +124,10 @@ class FocalFit(NamedTuple):
 
 
 def doubt_unconfirmed(fit: FocalFit, gaussian: PoseGaussian | None, accuracy: Accuracy) -> FocalFit:
-    """Return the fit of a photo by itself, doubted more where the photo does not confirm what was given.
+    """Return the fit of a photo by itself, with more doubt if the photo does not confirm the claim.
 
-    If what was given says nothing, the position is only as exact as by the photo's own focal length, which
-    may be less than is wanted.
+    If the claim is worth nothing, the position is only as exact as by the photo's own focal length, which may
+    be less exact than is wanted.
     """
     if fit.of_picture is None or gaussian is None:
         return fit
@@ -155,22 +155,22 @@ def fit_focal(problem: Problem, best: Candidate, workers: Workers, is_first: boo
 
 
 def weigh_claim(prior: FocalPrior, camera: Camera, estimate: LensEstimate, free: LensEstimate) -> FocalFit:
-    """Weigh what was given of a camera against what the picture tells.
+    """Weigh the claim about a camera against the estimates by the picture.
 
-    That is an estimate with the focal length free, and one with all corrections of the lens free.
+    `estimate` is that with the focal length free, `free` that with all corrections of the lens free.
     """
     claim = make_claim(prior, camera)
-    told = estimate.told
+    by_picture = estimate.by_picture
     motion = estimate.motion
-    off, variance = marginal(told, claim, FOCAL)
+    off, variance = marginal(by_picture, claim, FOCAL)
     off -= claim.expected[FOCAL]
     opinion = Opinion(off, variance) if variance < MOST_VARIANCE else None
-    opinions = told, free.told
+    opinions = by_picture, free.by_picture
     tests = [claim.contradict(one)[0] for one in opinions]
     worst = np.abs(tests).max(axis=0)
     change, total, difference = average(prior, claim, estimate, opinion, float(worst.max()))
     fitted = FITTED if fits_radial(prior, camera) else FITTED[:1]
-    rest = [k for k in range(len(told.values)) if k not in fitted]
+    rest = [k for k in range(len(by_picture.values)) if k not in fitted]
     spread = total[np.ix_(rest, rest)] + np.outer(change[rest], change[rest])
     return FocalFit(
         change[fitted],
@@ -187,7 +187,7 @@ def weigh_claim(prior: FocalPrior, camera: Camera, estimate: LensEstimate, free:
 
 
 def list_matches(problem: Problem, candidate: Candidate, workers: Workers) -> Matches:
-    """Return the matches with the scan drawn near a candidate; none by whole views alone."""
+    """Return the matches with the scan drawn near a candidate; none if the profile is without matches."""
     if not problem.profile.uses_matches:
         return NO_MATCHES
     return draw_near(problem, candidate.pose, candidate.drawn, workers).matches
@@ -196,9 +196,9 @@ def list_matches(problem: Problem, candidate: Candidate, workers: Workers) -> Ma
 def average(
     prior: FocalPrior, claim: Claim, estimate: LensEstimate, opinion: Opinion | None, conflict: float
 ) -> tuple[Array, Array, Array]:
-    """Return the mean (5,) of picture and claim, its covariance (5, 5), and what both differ too much.
+    """Return the mean (5,) of picture and claim, its covariance (5, 5), and by how much they differ too much.
 
-    The variance of a focal length that was given grows by that if it is not by chance.
+    If the difference is not by chance, the variance of the given focal length grows by it.
     """
     precision = claim.precision
     wide = precision.copy()
@@ -206,18 +206,18 @@ def average(
         # as by DerSimonian and Laird (1986)
         wide[FOCAL] = 1.0 / max(opinion.off**2 - opinion.variance, prior.deviation**2)
     if conflict > DISAGREE:
-        precision = wide  # the picture says where to look next
-    told = estimate.told
-    goal = told.information @ told.values + precision * claim.expected
-    total = np.linalg.inv(told.information + np.diag(precision))
-    return total @ goal, np.asarray(total), np.linalg.inv(told.information + np.diag(wide)) - total
+        precision = wide  # the next fit begins where the picture points
+    by_picture = estimate.by_picture
+    goal = by_picture.information @ by_picture.values + precision * claim.expected
+    total = np.linalg.inv(by_picture.information + np.diag(precision))
+    return total @ goal, np.asarray(total), np.linalg.inv(by_picture.information + np.diag(wide)) - total
 
 
 def find_errors_of_picture(estimate: LensEstimate, claim: Claim) -> Array:
-    """Return what the corrections would add to a pose's covariance (6, 6) if nothing of the claim holds."""
-    told = estimate.told
-    covariance = np.linalg.inv(told.information + np.diag(claim.wrong_deviations**-2.0))
-    off = covariance @ told.information @ (told.values - claim.expected)
+    """Return what the corrections would add to a pose's covariance (6, 6) if the whole claim were wrong."""
+    by_picture = estimate.by_picture
+    covariance = np.linalg.inv(by_picture.information + np.diag(claim.wrong_deviations**-2.0))
+    off = covariance @ by_picture.information @ (by_picture.values - claim.expected)
     return np.asarray(estimate.motion @ (covariance + np.outer(off, off)) @ estimate.motion.T)
 
 
@@ -253,12 +253,13 @@ def descend_lens(
 ) -> tuple[FreeEnd, FreeEnd]:
     """Descend with the focal length free, then with all corrections of the lens; return both lowest ends.
 
-    The first descents begin as the photo was taken last and, at first, with other focal lengths; the others
-    at their end, and as matches have it. The focal length goes on with the points that are seen from where it
-    ended: of those that are seen from elsewhere more agree with the pose there.
+    The descents of the focal length begin with that of the last fit and, in a first fit, with others too. The
+    descents of all corrections begin at the end of the former, and at the fit to the matches. The focal
+    length descends again with the points that are seen from its end: points that are seen from another pose
+    favour that pose.
     """
     pose = best.pose
-    shown = problem.show(mask_occluders(problem, best.seen, best.unoccluded).photo)
+    shown = problem.show(mask_occluders(problem, best.comparison, best.unoccluded).photo)
     corrections = Corrections(problem.given.cameras[0])
     wide = np.maximum(claim.wrong_deviations, claim.deviations)
     of_focal = Freedom(
@@ -298,7 +299,7 @@ def descend_lens(
 
 
 def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
-    """Remove the points near the edge of what a photo (H, W) shows, which corrections move across it."""
+    """Remove the points near the edge of what a photo (H, W) shows: corrections would move them across it."""
     inner = cv2.erode(is_valid.view(np.uint8), np.ones((EDGE_WIDTH, EDGE_WIDTH), np.uint8))
     offsets = points.around(pose.center_world).offsets.T.astype(np.float64)
     rays = rotate_points(offsets / np.linalg.norm(offsets, axis=1, keepdims=True), pose.R_cam_from_world)
@@ -309,14 +310,14 @@ def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
 def estimate_lens(
     problem: Problem, pose: Pose, end: FreeEnd, by_matches: MatchFit | None = None
 ) -> LensEstimate:
-    """Estimate the corrections of a lens at the end of a descent from a pose, which tells nothing if it left.
+    """Estimate the corrections of a lens at the end of a descent from a pose.
 
-    Added are errors of the picture's edge that all blocks may have in common and, as those of the matches
-    too, those of the scan.
+    A descent that ended far from the pose gives no information. Errors of the picture's edge are added, which
+    all blocks may share, and errors of the scan, which the matches share too.
     """
     estimate = estimate_corrections(end)
     if end.pose.distance(pose) > FAR_AWAY:
-        estimate = inform(estimate, np.zeros_like(estimate.told.information))
+        estimate = inform(estimate, np.zeros_like(estimate.by_picture.information))
     camera = problem.given.cameras[0].camera
     per_px = math.tau * camera.focal[0] / (0.5 * camera.width * problem.photo.panorama.rgb.shape[1])
     estimate = add_errors(estimate, (problem.method.edge_error * per_px) ** 2 * np.eye(len(LENS)))
@@ -328,12 +329,12 @@ def estimate_lens(
 
 
 def add_errors(estimate: LensEstimate, errors: Array) -> LensEstimate:
-    """Return an estimate with further errors (5, 5); what it does not tell stays so."""
-    is_known = estimate.told.information.any(axis=1)
-    covariance = invert(estimate.told.information) + errors * np.outer(is_known, is_known)
+    """Return an estimate with further errors (5, 5); corrections without information stay without."""
+    is_known = estimate.by_picture.information.any(axis=1)
+    covariance = invert(estimate.by_picture.information) + errors * np.outer(is_known, is_known)
     return inform(estimate, invert(covariance))
 
 
 def inform(estimate: LensEstimate, information: Array) -> LensEstimate:
-    """Return an estimate that has another information (5, 5)."""
-    return estimate._replace(told=estimate.told._replace(information=information))
+    """Return an estimate with its information (5, 5) replaced."""
+    return estimate._replace(by_picture=estimate.by_picture._replace(information=information))

@@ -21,9 +21,9 @@ from .verification import LEAST_ERROR
 MOST_LENS_CHANGE = np.array([0.5, 0.2, 0.3, 0.3, 0.6])  # corrections that are searched
 MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
 AGREES = 0.25  # least weight of a match that agrees
-MATCHED_DEVIATION = 0.015  # that errors in common add to a focal length by matches
+MATCHED_DEVIATION = 0.015  # of errors that all matches share, of the logarithm of a focal length by matches
 INFLATION = 4.0  # of the covariance by matches, so that 95 % of true focal lengths lie within two deviations
-LIMIT = 0.4  # of the change by matches
+LIMIT = 0.4  # largest change of the logarithm by matches
 
 
 class MatchFit(NamedTuple):
@@ -35,13 +35,13 @@ class MatchFit(NamedTuple):
 
 
 def add_matches(estimate: LensEstimate, by_matches: MatchFit) -> LensEstimate:
-    """Return the estimate with the focal length that matches tell."""
-    told = estimate.told
-    of_matches = np.zeros_like(told.information)
+    """Return the estimate with the focal length by the matches as further evidence."""
+    by_picture = estimate.by_picture
+    of_matches = np.zeros_like(by_picture.information)
     of_matches[FOCAL, FOCAL] = by_matches.information
-    both = told.information + of_matches
-    goal = told.information @ told.values + of_matches @ by_matches.values
-    return estimate._replace(told=told._replace(values=invert(both) @ goal, information=both))
+    both = by_picture.information + of_matches
+    goal = by_picture.information @ by_picture.values + of_matches @ by_matches.values
+    return estimate._replace(by_picture=by_picture._replace(values=invert(both) @ goal, information=both))
 
 
 def fit_matches(

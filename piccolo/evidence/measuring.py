@@ -28,8 +28,8 @@ Fit = FocalFit | SphereFit
 def measure(problem: Problem, found: Selection, fit: Fit | None, workers: Workers) -> Measured | None:
     """Measure how well the best candidate explains a photo, and how well the photo fixes the pose.
 
-    The pose is that of `estimate_errors`, the loss is taken there; the evidence is that of the candidate.
-    None if there is no pose, or no point is visible from it.
+    Pose and loss are those of `estimate_pose_errors`; the evidence is that of the candidate. None if there is
+    no pose, or no point is visible from it.
     """
     if found.best.score < 0.0:
         return None
@@ -64,7 +64,7 @@ def measure(problem: Problem, found: Selection, fit: Fit | None, workers: Worker
 
 
 def describe_geometry(problem: Problem, fit: Fit) -> Geometry:
-    """Return what was found out about the geometry of a photo."""
+    """Return the geometry of a photo by its fit, as the judge reads it."""
     std = math.sqrt(float(np.linalg.eigvalsh(fit.pose_covariance[3:, 3:])[-1]))
     found = Geometry(problem.given.cameras, fit.doubt, fit.conflict, std)
     if isinstance(fit, FocalFit):

@@ -1,8 +1,8 @@
 """The parts of a photo that the scan explains, that contradict it, and that were not scanned.
 
-Photo and scan are compared by local contrast, as the exposure differs. An occluder pollutes mean and
-deviation around it: they are computed again over what agrees. The agreement of photo and scan is a
-correlation, which a blank wall can't make high.
+Photo and scan are compared by local contrast, as the exposure differs. An occluder pollutes the local mean
+and deviation around it, so that these are computed again over the cells that agree. The agreement of photo
+and scan is a correlation, which a blank wall can't make high.
 """
 
 import math
@@ -28,12 +28,12 @@ OCCLUSION_WIDTHS = (
     256,
     128,
     64,
-)  # [px] of the comparison, cells of 1.4 degrees and more: where the scan is sparse
-LEAST_FILLED_SHARE = 0.75  # of the cells twice as wide in which anything is seen: less is sparse
+)  # [px] of the comparison, cells of 1.4 degrees, and of more where the scan is sparse
+LEAST_FILLED_SHARE = 0.75  # filled cells, as a share of filled cells twice as wide: less is sparse
 OCCLUSION_STATS_WIDTH = 64  # [px] of local means
 SIGMA_DEG = 15.0  # of the Gaussian for contrast
 AGREEMENT_WIDTH = 96  # [px] of the agreement, cells of 3.75 degrees
-NUM_STATISTICS_ROUNDS = 3  # of statistics over what agrees
+NUM_STATISTICS_ROUNDS = 3  # of statistics over the cells that agree
 FLAT_VARIANCE = np.float32(0.08**2)  # of a channel in [0, 1]: where it is less, a difference counts less
 CONTRADICTING = 0.8  # squared deviations, summed over channels; also the scale of Geman and McClure's weights
 CELL_AROUND = np.ones((3, 3), np.uint8)  # of a cell: an edge may be displaced by one
@@ -48,8 +48,8 @@ class Occlusion:
     """Photo and scan compared at a pose, on a small equirectangular grid."""
 
     is_valid: Mask  # (H, W) where the photo shows anything
-    is_compared: Mask  # (H, W) and the scan, there or beside it
-    is_contradicted: Mask  # (H, W) and they differ
+    is_compared: Mask  # (H, W) where the scan shows something too, in the cell or next to it
+    is_contradicted: Mask  # (H, W) where both are compared and differ
 
     def fractions(self) -> tuple[float, float]:
         """Return the fractions of the photo, by solid angle, that are explained and that contradict."""
@@ -118,8 +118,8 @@ def write_squares(
     """Write the squared distances (H, W) of the photo's contrast from a range (H, W, 3), `low` to `high`.
 
     The range is that of the scan within one cell, so that an edge displaced by less makes no difference.
-    They are summed over the photo's channels (H, W, 3), normalised by its statistics (H, W, 6). In flat
-    surroundings, of the photo or of the scan (H, W, 6), they count less.
+    The squares are summed over the photo's channels (H, W, 3), normalised by its statistics (H, W, 6). They
+    count less in flat surroundings, by the statistics of the photo or of the scan (H, W, 6).
     """
     for i in range(squares.shape[0]):
         for j in range(squares.shape[1]):

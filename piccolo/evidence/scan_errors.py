@@ -6,15 +6,15 @@ from ..geometry.pose import Pose
 from ..scan_map.scan_map import ScanMap
 from ..system.arrays import Array
 
-SHAPE_TURN = 0.003  # [rad] by which edges of a photo are not where the scan's are, in all blocks alike
+SHAPE_TURN = 0.003  # [rad] by which edges of a photo are displaced from the scan's, alike in all blocks
 SHAPE_MOVE = 0.01  # [m]
 
 
 def scan_covariance(scan_map: ScanMap, acting_range: float) -> Array:
     """Return the covariance (6, 6) [rad, m], in the map's axes, of errors of the scan.
 
-    These are correlated over many blocks: its noise and doubled surfaces (`surface_variance`); of shape alone
-    its edges too.
+    They are correlated over many blocks: errors of noise and doubled surfaces (`surface_variance`), and in a
+    scan without colours those of its edges.
     """
     surface = scan_map.surface_variance
     covariance = np.zeros((6, 6))
@@ -28,7 +28,7 @@ def scan_covariance(scan_map: ScanMap, acting_range: float) -> Array:
 def layer_covariance(scan_map: ScanMap, pose: Pose, acting_range: float) -> Array:
     """Return the covariance (6, 6) [rad, m] of a pose in the map by two layers of the scan's surfaces.
 
-    It is apart from `scan_covariance`, as it is no evidence that a photo was taken elsewhere.
+    It is not part of `scan_covariance`, as it is no evidence that a photo was taken elsewhere.
     """
     if not scan_map.layers.any():
         return np.zeros((6, 6))
@@ -37,7 +37,7 @@ def layer_covariance(scan_map: ScanMap, pose: Pose, acting_range: float) -> Arra
 
 
 def displacement_variance(scan_map: ScanMap, pose: Pose, acting_range: float) -> Array:
-    """Return the covariance (3, 3) [m^2], in the map's axes, by which surfaces lie beside where they are."""
+    """Return the covariance (3, 3) [m^2], in the map's axes, of the scan's surfaces about the true ones."""
     common = scan_covariance(scan_map, acting_range) + layer_covariance(scan_map, pose, acting_range)
     return common[3:, 3:] + scan_map.displacement**2 * np.eye(3)
 
@@ -45,8 +45,8 @@ def displacement_variance(scan_map: ScanMap, pose: Pose, acting_range: float) ->
 def gap_variance(motion: Array, place: Array, reach: float) -> float:
     """Return the variance [m^2] of a position at a place (3,) along any axis by layers with a motion (3, 3).
 
-    It is a twelfth, as of a uniform density between both layers, of their mean square distance within reach
-    [m]: a pose may follow one layer in some directions and the other in others.
+    It is a twelfth of the mean square distance of the layers within `reach` [m], which is the variance of a
+    uniform density between both: a pose may follow one layer in some directions and the other in others.
     """
     middle, turn, move = motion
     gap = move + np.cross(turn, place - middle)

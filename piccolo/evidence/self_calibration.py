@@ -1,8 +1,9 @@
 """Poses found together with corrections of the photo's geometry, by the loss of the default method.
 
-What a photo says of its own geometry is a claim. The scan's points are displaced as a photo with corrections
-would show them (`camera.corrections`), so that pose and corrections descend together: no photo is projected
-again. What fixes the corrections follows from the blocks of the sphere, as for a pose's covariance.
+The geometry that a photo's file states is a claim. The scan's points are displaced as a photo with
+corrections would show them (`camera.corrections`), so that pose and corrections are optimised together and no
+photo is projected again. The errors of the corrections follow from the blocks of the sphere, as those of a
+pose do.
 """
 
 from typing import NamedTuple
@@ -11,7 +12,7 @@ import numpy as np
 
 from ..geometry.gauss_newton import Equations, minimize
 from ..geometry.pose import Pose, step
-from ..judge.claim import Told
+from ..judge.claim import PictureCorrections
 from ..optimize.channel_loss import ChannelProblem
 from ..optimize.corrected_equations import NUM_OF_POSE, FreeSums, sum_free_equations
 from ..photo.camera.corrections import Corrections
@@ -22,18 +23,18 @@ from ..system.arrays import Array, Array32, Int64s
 from ..views.view import Cells
 from .covariance import jackknife_gradients, sort_by_block, take
 
-MASKED_LOSS = 0.25  # of a point on masked pixels, times the square of the loss's scale
-# of the matrix of Gauss and Newton, which ignores that the loss flattens: with it, 95 % of true corrections
-# of 48 crops of three scenes lie within two deviations
+MASKED_LOSS = 0.25  # loss of a point on masked pixels, as a multiple of the square of the loss's scale
+# factor on the Gauss-Newton matrix, which ignores that the loss flattens: with this factor, 95 % of the true
+# corrections of 48 crops of three scenes lie within two deviations
 CURVATURE = 0.25
 
 
 class Freedom(NamedTuple):
-    """Corrections that are free, and how far."""
+    """Corrections that are free, and in which limits."""
 
     corrections: Corrections
-    deviations: Array  # (p,) of corrections of a geometry that is claimed wrongly; infinite: any is as likely
-    most: Array  # (p,) absolute values that are searched
+    deviations: Array  # (p,) expected of each correction, which the loss charges; infinite: it charges none
+    most: Array  # (p,) largest absolute values that are searched
 
 
 class FreeEnd(NamedTuple):
@@ -41,8 +42,8 @@ class FreeEnd(NamedTuple):
 
     pose: Pose
     values: Array  # (p,) corrections
-    loss: float  # with what the deviations of the freedom add
-    sums: FreeSums  # by the blocks of the sphere
+    loss: float  # with the charge for the corrections, by the deviations of the freedom
+    sums: FreeSums  # of the equations, by the blocks of the sphere
 
     @property
     def start(self) -> tuple[Pose, Array]:
@@ -53,7 +54,7 @@ class FreeEnd(NamedTuple):
 class LensEstimate(NamedTuple):
     """Corrections by the photo and the scan alone, and how the pose moves with them."""
 
-    told: Told
+    by_picture: PictureCorrections
     motion: (
         Array  # (6, p) of the pose with them: rotation about the camera's axes [rad], centre in the map [m]
     )
@@ -131,15 +132,15 @@ def estimate_corrections(end: FreeEnd, curvature: float = CURVATURE) -> LensEsti
     motion[3:] = end.pose.R_cam_from_world.T @ motion[3:]
     by_slopes = inverse[NUM_OF_POSE:]
     of_blocks = by_slopes @ end.sums.matrices[shown] @ by_slopes.T
-    return LensEstimate(Told(end.values, invert(covariance), of_blocks), np.asarray(motion))
+    return LensEstimate(PictureCorrections(end.values, invert(covariance), of_blocks), np.asarray(motion))
 
 
 def displace_blocks(end: FreeEnd, variance: Array) -> Array:
     """Return the covariance (p, p) of the corrections by surfaces of the scan that are displaced.
 
-    What is seen in each block is displaced by itself, with the covariance `variance` (3, 3) [m^2] in the map.
-    It is as if the camera had moved the other way for the block's points alone, so that the slopes change by
-    the block's part of the normal equations.
+    The surfaces of each block are displaced independently, with the covariance `variance` (3, 3) [m^2] in the
+    map. A displacement acts as if the camera had moved the other way for the block's points alone, so that
+    the slopes change by the block's part of the normal equations.
     """
     R = end.pose.R_cam_from_world
     inverse = np.linalg.pinv(end.sums.matrices.sum(axis=0))
@@ -148,7 +149,7 @@ def displace_blocks(end: FreeEnd, variance: Array) -> Array:
 
 
 def invert(matrix: Array) -> Array:
-    """Return the inverse (p, p) of a covariance or of its inverse; 0 in directions in which that is 0."""
+    """Return the inverse (p, p) of a covariance or of an information; 0 in directions in which this is 0."""
     found = np.linalg.pinv(matrix, hermitian=True)
     values, axes = np.linalg.eigh(0.5 * (found + found.T))
     return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)

@@ -2,7 +2,7 @@
 
 A photo may look like many places. Only at the right one do its local features lie where those of the drawn
 scan lie. After Torii et al., "24/7 Place Recognition by View Synthesis" (CVPR 2015), and InLoc's
-verification of poses (Taira et al., CVPR 2018). Photos beside it in a walk are such pictures too.
+verification of poses (Taira et al., CVPR 2018). In a walk, a photo is matched with neighbouring frames too.
 """
 
 from collections.abc import Sequence
@@ -37,11 +37,11 @@ from ..views.view_image import ViewImage, render_gray
 from .occlusion import EXPLAINED, occlusion_mask
 
 PLACE = 0.1  # [m] the scan is drawn at positions on a grid of this spacing
-TURN = 0.05  # [rad] and at rotation vectors on one of this
-DRAWN_AROUND = 12  # [px] around the photo that are drawn too: it moves when the pose is refined
+TURN = 0.05  # [rad] and at rotation vectors on a grid of this spacing
+DRAWN_AROUND = 12  # [px] drawn beyond the photo's edge, which moves when the pose is refined
 LEAST_ERROR = 2e-3  # [rad] of a keypoint along an axis: a third of a pixel
-# of the covariance by matches with the drawn scan, whose errors are not independent: by 76 crops of three
-# scenes
+# factor on the covariance by matches with the drawn scan, whose errors are not independent; measured on 76
+# crops of three scenes
 DRAWN_INFLATION = 4.0
 
 
@@ -53,10 +53,11 @@ class Verified(NamedTuple):
 
 
 def verify(problem: Problem, pose: Pose, drawn: Matches) -> Verified:
-    """Find the pose that most matches near a pose agree with, and count these.
+    """Find the pose near a pose with which most matches agree, and count these.
 
-    The pose is fitted to all matches: with the scan drawn there, and with each of the photos beside. Those of
-    the one picture with which most agree are counted. A wrong pose of a photo beside misleads this one.
+    It is fitted to all matches: with the scan drawn there, and with each of the photos beside. The count is
+    the largest among these pictures, each counted by itself. A photo beside whose pose is wrong misleads this
+    photo.
     """
     pictures = [drawn, *problem.beside]
     found = exact_pose(merge_matches(pictures), pose)
@@ -69,8 +70,9 @@ def verify(problem: Problem, pose: Pose, drawn: Matches) -> Verified:
 def place_by_matches(method: Method, pose: Pose, matches: Matches) -> tuple[Pose, Array] | None:
     """Return the pose near another with which most matches with the drawn scan agree, and its covariance.
 
-    None if no more agree than by chance. The covariance (6, 6) is as of `PoseGaussian`. Of what is farther
-    off than in rooms, matches tell the position as much less exactly: it may be as much farther away.
+    None if no more matches agree than by chance. The covariance (6, 6) is as of `PoseGaussian`. The farther
+    away the surfaces, the less exact is a position by matches: where they are farther than in rooms, the pose
+    may lie farther from the other in proportion.
     """
     found = exact_pose(matches, pose)
     if found is None or found.num_matches <= method.chance_matches:
@@ -95,7 +97,7 @@ def match_covariance(matches: Matches, pose: Pose) -> Array:
 def draw_near(problem: Problem, pose: Pose, known: Drawn | None, workers: Workers) -> Drawn:
     """Match the photo's features with the scan drawn near a pose, on a grid of poses.
 
-    `known` are those near another pose: the same if it is near enough.
+    `known` are the matches near another pose: they are returned if both poses have the same pose of the grid.
     """
     key, drawn_at = round_pose(pose)
     if known is not None and known.key == key:
@@ -113,16 +115,16 @@ def round_pose(pose: Pose) -> tuple[bytes, Pose]:
 
 
 def find_all_drawn(problem: Problem, pose: Pose, workers: Workers) -> Located:
-    """Draw all that the photo would show at a pose in the map; return the keypoints."""
+    """Draw the scan as the photo would show it at a pose in the map; return the keypoints of the drawing."""
     parts = workers.map(partial(find_drawn, problem, pose), problem.photo.seen(workers).views, "draw")
     ranges = np.concatenate([ranges for _, ranges in parts])
     return Located(join_keypoints([keypoints for keypoints, _ in parts]), ranges, pose)
 
 
 def find_copies(problem: Problem, pose: Pose, others: Sequence[Pose], workers: Workers) -> list[bool]:
-    """Return True for each of other poses at which the scan looks as at a pose, as in rooms of one kind.
+    """Return True for each of the other poses at which the scan looks as it does at a pose.
 
-    The scan drawn at the one is matched with the scan drawn at the other.
+    Rooms of one kind look so. The scan drawn at the one pose is matched with the scan drawn at the other.
     """
     if not others:
         return []
@@ -138,7 +140,7 @@ def find_copies(problem: Problem, pose: Pose, others: Sequence[Pose], workers: W
 def find_ranges(problem: Problem, pose: Pose, workers: Workers) -> Array32:
     """Return the ranges (N,) [m] of a photo's keypoints, from the scan, if it was taken at a pose in the map.
 
-    Those on what the scan does not show, as people and furniture that has moved, have 0.
+    Keypoints on things that the scan does not show, as people and moved furniture, have the range 0.
     """
     views, keypoints = problem.photo.seen(workers)
     panorama = problem.photo.panorama
@@ -152,7 +154,7 @@ def find_ranges(problem: Problem, pose: Pose, workers: Workers) -> Array32:
 
 
 def place_keypoints(problem: Problem, pose: Pose, workers: Workers) -> Located:
-    """Return the keypoints of a photo that was taken at a pose in the map, those that have ranges there."""
+    """Return the keypoints of a photo that was taken at a pose in the map, if the scan gives them a range."""
     ranges = find_ranges(problem, pose, workers)
     is_seen = np.flatnonzero(ranges > 0.0)
     return Located(problem.photo.seen(workers).keypoints.take(is_seen), ranges[is_seen], pose)
@@ -161,8 +163,8 @@ def place_keypoints(problem: Problem, pose: Pose, workers: Workers) -> Located:
 def match_beside(problem: Problem, other: Located, workers: Workers) -> Matches:
     """Match a photo's features with those of another photo.
 
-    What both show in the same direction is left out: it may be carried along, as dirt on a lens is. There
-    are no matches if the mirrored photo has more.
+    Keypoints that both have in the same direction are left out: they may be carried along, as dirt on a lens
+    is. No matches are returned if the mirrored photo has more.
     """
     own = problem.photo.seen(workers).keypoints
     mine, theirs = match_pictures(own, other.keypoints)
@@ -174,7 +176,7 @@ def match_beside(problem: Problem, other: Located, workers: Workers) -> Matches:
 
 
 def draw(problem: Problem, pose: Pose, view: PerspectiveView) -> tuple[ViewImage, Bytes]:
-    """Draw what a view of a photo would show at a pose, and a little around; return also its mask."""
+    """Draw the scan as a view of a photo would show it at a pose, a little larger; return also its mask."""
     mask = view.cut_mask(add_margin(problem.photo.panorama.is_valid))
     shown = cv2.dilate(mask, np.ones((2 * DRAWN_AROUND + 1,) * 2, np.uint8))
     turned = Pose(view.R_sphere_from_view.T @ pose.R_cam_from_world, pose.center_world)
@@ -182,7 +184,7 @@ def draw(problem: Problem, pose: Pose, view: PerspectiveView) -> tuple[ViewImage
 
 
 def find_drawn(problem: Problem, pose: Pose, view: PerspectiveView) -> tuple[Keypoints, Array32]:
-    """Draw what a view of the photo would show at a pose; return the keypoints, and their ranges (N,) [m]."""
+    """Draw the scan as a view would show it at a pose; return its keypoints, and their ranges (N,) [m]."""
     image, shown = draw(problem, pose, view)
     found = find_in_view(image.gray, np.where(image.is_filled, shown, np.uint8(0)), view)
     ranges = image.ranges[view.project(found.rays)]

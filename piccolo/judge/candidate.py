@@ -73,8 +73,8 @@ class Candidate:
     """A pose that may be right, with its evidence, as far as it was asked for."""
 
     pose: Pose  # in the map
-    score: float  # of `seen`
-    seen: Comparison  # of the photo with the scan there
+    score: float  # of the comparison
+    comparison: Comparison  # of the photo with the scan as seen from the pose
     against_prior: tuple[Contradiction, ...] = ()  # what was told that the pose contradicts
     num_matches: int | None = None  # features that agree with the drawn scan; None: it was not drawn
     edge_score: float | None = None  # of the edges drawn there, in a scan without colours

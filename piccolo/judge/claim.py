@@ -12,7 +12,7 @@ LEAST_CHANCE = 1e-300  # that a distribution is asked for
 MANY = 1e12  # degrees of freedom of what is known
 
 
-class Told(NamedTuple):
+class PictureCorrections(NamedTuple):
     """Corrections (p,) of a geometry by a picture and a scan alone."""
 
     values: Array  # (p,)
@@ -36,7 +36,7 @@ class Claim(NamedTuple):
         """Inverse variances (p,)."""
         return np.asarray(self.deviations**-2.0)
 
-    def contradict(self, told: Told) -> tuple[Array, Array]:
+    def contradict(self, by_picture: PictureCorrections) -> tuple[Array, Array]:
         """Return by how many deviations each correction (p,) is wrong if only it is, and their inverse.
 
         It is the score test (Rao, 1948) of each correction, the others as claimed; the inverse deviation is
@@ -44,24 +44,24 @@ class Claim(NamedTuple):
         of a normal distribution that are as rare as what was found is by Student's.
         """
         P = np.diag(self.precision)
-        S = P - P @ np.linalg.inv(told.information + P) @ P  # inverse of the covariance of picture less claim
-        scores = S @ (told.values - self.expected)
+        S = P - P @ np.linalg.inv(by_picture.information + P) @ P  # inverse covariance of picture less claim
+        scores = S @ (by_picture.values - self.expected)
         inverse = np.sqrt(np.maximum(np.diag(S), 1e-300))
         of_picture = np.maximum(1.0 - np.einsum("ij,ij,i->j", S, S, 1.0 / np.diag(P)) / inverse**2, 0.0)
-        freedom = count_variance_freedom(told.of_blocks, S) / np.maximum(of_picture, 1e-6) ** 2
+        freedom = count_variance_freedom(by_picture.of_blocks, S) / np.maximum(of_picture, 1e-6) ** 2
         return np.sign(scores) * as_normal(np.abs(scores) / inverse, freedom), np.asarray(inverse)
 
-    def doubt(self, told: Told) -> float:
+    def doubt(self, by_picture: PictureCorrections) -> float:
         """Return the probability that the claim is wrong in one respect, by the odds of each."""
-        conflicts, inverse = self.contradict(told)
+        conflicts, inverse = self.contradict(by_picture)
         wide = 1.0 + (self.wrong_deviations * inverse) ** 2  # of the variance, where it is wrong
         logs = np.minimum(0.5 * conflicts**2 * (1.0 - 1.0 / wide), MOST_LOG)
         odds = float(np.sum(self.wrong_shares / (1.0 - self.wrong_shares) * np.exp(logs) / np.sqrt(wide)))
         return odds / (1.0 + odds)
 
-    def conflict(self, told: Told) -> float:
+    def conflict(self, by_picture: PictureCorrections) -> float:
         """Return the greatest number of deviations by which one correction is wrong."""
-        return float(np.abs(self.contradict(told)[0]).max())
+        return float(np.abs(self.contradict(by_picture)[0]).max())
 
 
 def count_variance_freedom(of_blocks: Array, weights: Array) -> Array:
@@ -82,14 +82,14 @@ def as_normal(deviations: Array, freedom: Array) -> Array:
     return np.asarray(-ndtri(np.maximum(stdtr(freedom, -deviations), LEAST_CHANCE)))
 
 
-def marginal(told: Told, claim: Claim, k: int) -> tuple[float, float]:
+def marginal(by_picture: PictureCorrections, claim: Claim, k: int) -> tuple[float, float]:
     """Return value and variance of one correction by the picture, the others as claimed.
 
     The variance is infinite if the picture says nothing of it.
     """
     precision = claim.precision
     precision[k] = 1e-12
-    covariance = np.linalg.inv(told.information + np.diag(precision))
-    mean = covariance @ (told.information @ told.values + precision * claim.expected)
+    covariance = np.linalg.inv(by_picture.information + np.diag(precision))
+    mean = covariance @ (by_picture.information @ by_picture.values + precision * claim.expected)
     variance = float(covariance[k, k])
     return float(mean[k]), variance if variance < 1e6 else math.inf

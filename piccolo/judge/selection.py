@@ -64,7 +64,7 @@ def assess_alone(profile: Profile, ranked: Sequence[Candidate]) -> list[Standing
 
 def assess(profile: Profile, found: Selection) -> list[Standing]:
     """Return the evidence for the best candidate and for others, compared over what both views show."""
-    ratios = [1.0, *(h.seen.compute_ratio(found.best.seen) for h in found.alternatives)]
+    ratios = [1.0, *(h.comparison.compute_ratio(found.best.comparison) for h in found.alternatives)]
     alone = assess_alone(profile, found.candidates)
     return [standing._replace(ratio=ratio) for standing, ratio in zip(alone, ratios, strict=True)]
 
@@ -80,7 +80,7 @@ def select(profile: Profile, found: Selection) -> Selection:
     method = profile.method
     ranked = found.candidates
     alone = assess_alone(profile, ranked)
-    ratios = [[other.seen.compute_ratio(one.seen) for other in ranked] for one in ranked]
+    ratios = [[other.comparison.compute_ratio(one.comparison) for other in ranked] for one in ranked]
     odds = np.array(
         [[log_odds(a._replace(ratio=v), method) for a, v in zip(alone, row, strict=True)] for row in ratios]
     )

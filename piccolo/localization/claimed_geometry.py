@@ -133,8 +133,8 @@ def calibrate_sphere(
     other = retake_as_found(problem, found, camera, workers) if is_suspect else None
     if other is not None:
         return other
-    conflict = CLAIM.conflict(estimate.told)
-    doubt = CLAIM.doubt(estimate.told)
+    conflict = CLAIM.conflict(estimate.by_picture)
+    doubt = CLAIM.doubt(estimate.by_picture)
     return problem, found, SphereFit(camera, here, True, conflict, doubt)
 
 

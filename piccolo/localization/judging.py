@@ -72,7 +72,7 @@ def promote(
     """Put a copy of the best pose's place first, refined, with the evidence that belongs to it."""
     best = settle(problem, copy, workers)
     others = [h for h in selection.candidates if h.pose is not copy.pose]
-    ratios = [h.seen.compute_ratio(best.seen) for h in others]
+    ratios = [h.comparison.compute_ratio(best.comparison) for h in others]
     promoted = complete(problem, Selection(best, tuple(others), max(ratios)), workers)
     if isinstance(fit, FocalFit):
         fit = fit_focal(problem, promoted.best, workers, is_first=False)

@@ -107,8 +107,8 @@ def climb_unoccluded(problem: Problem, start: Candidate, workers: Workers) -> Ca
     best = start
     for _ in range(MAX_UNOCCLUDED):
         before = best
-        best = replace(best, unoccluded=mask_occluders(problem, best.seen, best.unoccluded))
-        is_occluded = bool(best.seen.contradicts.any())
+        best = replace(best, unoccluded=mask_occluders(problem, best.comparison, best.unoccluded))
+        is_occluded = bool(best.comparison.contradicts.any())
         climbed = climb_masked(problem, best, workers) if is_occluded else climb_whole(problem, best, workers)
         gain = climbed.score - before.score
         best = climbed if gain > 0.0 or climbed.pose is before.pose else best
@@ -142,7 +142,7 @@ def climb_to_full(problem: Problem, start: Candidate, workers: Workers) -> Candi
 
 def settle(problem: Problem, found: Candidate, workers: Workers) -> Candidate:
     """Descend until the pose converges, so that it does not depend on where the search began."""
-    masked = mask_occluders(problem, found.seen, found.unoccluded)
+    masked = mask_occluders(problem, found.comparison, found.unoccluded)
     return converge(problem, replace(found, unoccluded=masked), LAST, workers)
 
 

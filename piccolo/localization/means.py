@@ -45,14 +45,15 @@ def describe_candidates(problem: Problem, candidates: Sequence[Candidate]) -> li
 def describe_candidate(problem: Problem, candidate: Candidate) -> Step:
     """Describe a candidate with its evidence, in the world."""
     pose = problem.scan_map.to_world(candidate.pose)
-    seen = candidate.seen
-    area = float(seen.visible_area.sum())
+    comparison = candidate.comparison
+    area = float(comparison.visible_area.sum())
+    contradicted = float(comparison.visible_area[comparison.contradicts].sum())
     return {
         "center_world": pose.center_world.tolist(),
         "R_cam_from_world": pose.R_cam_from_world.tolist(),
         "score": candidate.score,
         "seen_fraction": area,
-        "contradicted_fraction": float(seen.visible_area[seen.contradicts].sum()) / max(area, 1e-9),
+        "contradicted_fraction": contradicted / max(area, 1e-9),
         "num_matches": candidate.num_matches,
         "edge_score": candidate.edge_score,
         "against_prior": [contradiction.reason for contradiction in candidate.against_prior],

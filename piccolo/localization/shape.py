@@ -102,7 +102,7 @@ def find_alike(problem: Problem, pose: Pose, effort: Effort, workers: Workers) -
 
     def is_alike(other: Candidate) -> bool:
         is_elsewhere = not ONE_ANSWER.holds(other.pose, pose)
-        return is_elsewhere and other.seen.compute_ratio(here) >= LEAST_ALIKE
+        return is_elsewhere and other.comparison.compute_ratio(here) >= LEAST_ALIKE
 
     return [end.pose for end in ends if is_alike(end)]
 
