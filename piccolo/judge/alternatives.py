@@ -9,7 +9,7 @@ import numpy as np
 from ..geometry.nearness import ONE_ANSWER, Nearness, non_maximum_suppression
 from ..geometry.pose import Pose
 
-MAX_ALTERNATIVES = 5  # reported
+MAX_ALTERNATIVES = 5  # that a result reports
 
 
 @dataclass(frozen=True)

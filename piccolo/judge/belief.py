@@ -1,7 +1,8 @@
 """The belief in a photo's poses, and the status that follows from it.
 
-Three questions have answers of their own: which place is right, whether the pose is exact enough there, and
-whether what was given, as a focal length, holds. Only `Belief.probabilities` multiplies them.
+Three questions have separate answers: which place is right, whether the pose is exact enough there, and
+whether the given geometry of the photo, as a focal length, is right. Only `Belief.probabilities` multiplies
+the answers.
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from ..system.arrays import Array
 from .probability import NOT_LOCALIZED, classify
 from .reasons import Reason
 
-UNCONFIRMED = 0.1  # chosen: doubt of what was given, where the photo can't confirm it as exactly as is wanted
+UNCONFIRMED = 0.1  # chosen: doubt of given values that the photo can't confirm as exactly as is wanted
 
 
 @dataclass(frozen=True)
@@ -23,17 +24,17 @@ class Belief:
 
     place: tuple[float, ...]  # (K + 1,) that the place of each of K poses is right, and that none of them is
     within: float = 1.0  # that the best pose is as exact as wanted if its place is right
-    doubt: float = 0.0  # that what was given of the photo's geometry is wrong
-    ruled_out: frozenset[Reason] = frozenset()  # why no pose is right, whatever others say
+    doubt: float = 0.0  # that the given geometry of the photo is wrong
+    ruled_out: frozenset[Reason] = frozenset()  # reasons why no pose is right, whatever its probability
 
     @property
     def best_place(self) -> float:
-        """Probability that the place of the best pose is right; 0 without one, and if it is ruled out."""
+        """Probability that the place of the best pose is right; 0 without a pose, and if it is ruled out."""
         return 0.0 if self.ruled_out or len(self.place) < 2 else self.place[0]
 
     @property
     def sound_places(self) -> Array:
-        """Probabilities (K + 1,) that a place and what was given are right; 0 for all that is ruled out."""
+        """Probabilities (K + 1,) that each place and the given geometry are right, and that none is."""
         sound = 0.0 if self.ruled_out else 1.0 - self.doubt
         return _complete(sound * np.array(self.place[:-1]))
 
@@ -43,11 +44,11 @@ class Belief:
         return _complete(self.within * self.sound_places[:-1])
 
     def scale(self, factor: float) -> "Belief":
-        """Return this with the probabilities of all places multiplied by a factor."""
+        """Return the belief with the probabilities of all places multiplied by a factor."""
         return replace(self, place=make_belief(factor * np.array(self.place[:-1])).place)
 
     def rule_out(self, *reasons: Reason) -> "Belief":
-        """Return this with further reasons why no pose is right."""
+        """Return the belief with further reasons why no pose is right."""
         return replace(self, ruled_out=self.ruled_out.union(reasons))
 
 

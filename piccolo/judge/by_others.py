@@ -11,7 +11,7 @@ from ..system.arrays import Array
 from .belief import Belief, make_belief
 
 LEAST_NONE = 1e-6
-MISSED = 0.25  # chosen: of photos, those without a right pose found (of BENCHMARK.md's phone photos a sixth)
+MISSED = 0.25  # chosen: share of photos without a right pose found (a sixth of BENCHMARK.md's phone photos)
 IS_NEARBY = 0.8  # chosen: probability that a photo of a group was taken within reach of the others
 LOCAL_ERRORS = np.diag(np.repeat([math.radians(2.0) ** 2, 0.15**2], 3))  # chosen: of local optima, [rad, m]
 
@@ -33,7 +33,7 @@ class Shares(NamedTuple):
         return self.right + self.missed
 
     def weigh_own(self, likelihood_ratio: float) -> "Shares":
-        """Return these by how much likelier the own pose is as the right one than as a local optimum."""
+        """Return the shares after evidence about the own pose: of a right one against a local optimum."""
         right = self.right * likelihood_ratio
         here = self.here / (right + self.missed)
         return Shares(right * here, self.missed * here)
@@ -44,10 +44,10 @@ def believe_together(
 ) -> Belief:
     """Return the belief in a photo's poses in a bundle, of which the first is believed.
 
-    `bundles` (K + 1,) are the probabilities of K poses of the bundle, and of none. How likely the pose is
-    exact enough is `within_own` if the photo's own pose is right, else `within_others`, by the pose that the
-    others expect. `alone` is the belief of a photo that is sure by itself: that others show nothing says
-    nothing against it.
+    `bundles` (K + 1,) are the probabilities of K poses of the bundle, and of none. The pose is exact enough
+    with the probability `within_own` if the photo's own pose is right, else `within_others`, that of the pose
+    expected by the others. `alone` is the belief in a photo that is sure by itself: that the other photos
+    show nothing is no evidence against it.
     """
     place = shares.here * float(bundles[0])
     within = (shares.right * within_own + shares.missed * within_others) / shares.here
@@ -61,9 +61,10 @@ def believe_together(
 def believe_nearby(near: Belief, elsewhere: float, gain: float) -> Belief:
     """Return the belief in a photo that was searched where others of its group were taken.
 
-    `near` is by its own picture, as if a whole scan had been searched, which is `gain` times as large. If it
-    was not taken with the others, it has the odds of its places `elsewhere`. That others tell the place says
-    nothing of local optima: without evidence of its own no photo is exact.
+    `near` is the belief by the photo alone, as if the whole scan had been searched, which is `gain` times as
+    large as the part near the others. `elsewhere` are the odds of its places if it was not taken with them.
+    The others give the place, but do not exclude local optima there: without evidence of its own, no photo is
+    exact.
     """
     odds = np.array(near.place[:-1]) / max(near.place[-1], LEAST_NONE)
     here = IS_NEARBY * gain * odds
@@ -75,7 +76,7 @@ def believe_nearby(near: Belief, elsewhere: float, gain: float) -> Belief:
 def believe_beside(alone: Belief, confidences: Sequence[float], within: float | None) -> Belief:
     """Return the belief in a photo beside others, which is no surer than the surest of them.
 
-    `within` is that of the mean of its own pose and the one by them; None if there is no mean.
+    `within` belongs to the mean of its own pose and the pose by the others; None if there is no mean.
     """
     belief = alone.scale(max(confidences))
     return belief if within is None else replace(belief, within=within)
@@ -84,8 +85,8 @@ def believe_beside(alone: Belief, confidences: Sequence[float], within: float | 
 def share_place(best: Belief, confidences: Sequence[float]) -> tuple[float, list[float]]:
     """Divide the place of the best of several results among them, in proportion to their confidences.
 
-    The results are at different places. Returns the factor of the best's own places, and the places of the
-    others.
+    The results are at different places. Returns the factor by which the best result's own places are
+    multiplied, and the probabilities of the others' places.
     """
     shares = np.array(confidences) / sum(confidences)
     return float(shares[0]), (best.place[0] * shares[1:]).tolist()

@@ -1,4 +1,4 @@
-"""Candidates: poses that may be right, each with its evidence; who decides reads them, computing nothing."""
+"""Candidates: poses that may be right, each with its evidence. The judge reads it, and computes none."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from ..system.arrays import Array, Mask
 from .reasons import Contradiction
 
 CONTRADICTS = 0.1  # a block with a lower correlation is left out of the local means and deviations
-LEAST_SHARED = 0.3  # fraction of what the poorer view shows
+LEAST_SHARED = 0.3  # of the area of the poorer of two views: if they share less, they are not compared
 MAX_COMPARED = 8  # alternatives of the best pose
 
 
@@ -32,20 +32,20 @@ class Comparison(NamedTuple):
         return self.score_beyond(CHANCE_CORRELATION)
 
     def score_beyond(self, chance: float) -> float:
-        """Return the score where chance explains as much of a block as `chance`."""
+        """Return the score if `chance` is the correlation of a block that is reached by chance."""
         beyond = np.maximum(self.correlation - chance, 0.0) / (1.0 - chance)
         return float(beyond @ self.area) / max(self.valid_area, 1e-9)
 
     @property
     def contradicts(self) -> Mask:
-        """Mask (blocks,) of those that contradict the scan: an occluder, or the wrong pose."""
+        """Mask (blocks,) of the blocks that contradict the scan, by an occluder or as the pose is wrong."""
         return (self.correlation < CONTRADICTS) & (self.visible_area > 0.0)
 
     def compute_ratio(self, other: "Comparison") -> float:
         """Return the ratio of the area explained by this pose to another's, over blocks that both views show.
 
-        Over all blocks, a pose from which more was scanned would gain by that alone. 0 if hardly any block
-        is shared.
+        Over all blocks, a pose from which more of the scan is seen would gain by that alone. 0 if hardly any
+        block is shared.
         """
         shared = np.minimum(self.visible_area, other.visible_area)
         if shared.sum() < LEAST_SHARED * min(self.visible_area.sum(), other.visible_area.sum()):
@@ -70,21 +70,21 @@ class Drawn(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A pose that may be right, with its evidence, as far as it was asked for."""
+    """A pose that may be right, with the evidence that was computed for it so far."""
 
     pose: Pose  # in the map
     score: float  # of the comparison
     comparison: Comparison  # of the photo with the scan as seen from the pose
-    against_prior: tuple[Contradiction, ...] = ()  # what was told that the pose contradicts
+    against_prior: tuple[Contradiction, ...] = ()  # prior knowledge that the pose contradicts
     num_matches: int | None = None  # features that agree with the drawn scan; None: it was not drawn
-    edge_score: float | None = None  # of the edges drawn there, in a scan without colours
+    edge_score: float | None = None  # of the scan's edges drawn at the pose, in a scan without colours
     is_climbed: bool = False  # no perturbation improves it
-    # what was made for this pose, and serves for poses near it too
+    # images made for this pose, which serve for poses near it too
     unoccluded: Unoccluded | None = None
     drawn: Drawn | None = None
 
     def forget(self) -> "Candidate":
-        """Return the candidate without what takes memory."""
+        """Return the candidate without the images and matches, which take memory."""
         return replace(self, unoccluded=None, drawn=None)
 
 
@@ -94,7 +94,7 @@ NO_CANDIDATE = Candidate(Pose(np.eye(3), np.zeros(3)), -1.0, Comparison(_EMPTY, 
 
 @dataclass(frozen=True)
 class Selection:
-    """The best candidate, and the best ones elsewhere, best first."""
+    """The best candidate, and the best candidates at other places, best first."""
 
     best: Candidate
     alternatives: tuple[Candidate, ...]
@@ -107,16 +107,16 @@ class Selection:
 
     @property
     def margin(self) -> float:
-        """Relative lead of the best, at least -1: the lesser of those by score and over both views."""
+        """Relative lead of the best, at least -1: by score, or over what both views show if that is less."""
         by_score = max([0.0, *(h.score for h in self.alternatives)]) / max(self.best.score, 1e-9)
         return max(1.0 - max(self.rival_ratio, by_score), -1.0)
 
     def take(self, ranked: Sequence[Candidate]) -> "Selection":
-        """Return the selection with other evidence for the same poses, the best first."""
+        """Return the selection with these candidates, the best first."""
         return replace(self, best=ranked[0], alternatives=tuple(ranked[1:]))
 
     def forget(self) -> "Selection":
-        """Return the selection without what takes memory."""
+        """Return the selection without the images and matches, which take memory."""
         return self.take([candidate.forget() for candidate in self.candidates])
 
 

@@ -13,14 +13,14 @@ from .result_parts import Evidence, FocalLength, SphereGeometry
 
 
 class Errors(NamedTuple):
-    """The errors of a pose that is found; None where the points do not fix it."""
+    """The errors of the pose of a photo; its fields are None where the points do not fix it."""
 
     gaussian: PoseGaussian | None  # the pose in the map with its covariance
     # largest deviation of the position if focal length and stitching were exact, as an angle [rad]
     std_of_fit: float | None
 
     def widen(self, common: Array) -> "Errors":
-        """Return these with a further error (6, 6) that photos have in common, as of a focal length."""
+        """Return the errors with a further one (6, 6) that photos have in common, as of a focal length."""
         return self._replace(gaussian=self.gaussian and self.gaussian.widen(common))
 
 
@@ -34,18 +34,18 @@ class Measured(NamedTuple):
     errors: Errors
     loss: float
     evidence: Evidence
-    contradicted: tuple[Contradiction, ...]  # what was given that the pose contradicts
+    contradicted: tuple[Contradiction, ...]  # prior knowledge that the pose contradicts
 
 
 class Geometry(NamedTuple):
     """The geometry of a photo, as found by comparing it with the scan."""
 
     cameras: tuple[Mount, ...]  # as found
-    doubt: float  # probability that what was given is wrong and has pulled the pose along
-    conflict: float  # deviations between picture and what was given
-    std: float  # [m] of the position by it
+    doubt: float  # probability that the given geometry is wrong and has pulled the pose along
+    conflict: float  # deviations between the picture and the given geometry
+    std: float  # [m] of the position by the errors of the geometry
     focal_length: FocalLength | None = None  # of a photo whose focal length was fitted
-    worst_correction: str = ""  # of that, the correction of the lens in which picture and given differ most
+    worst_correction: str = ""  # the correction of its lens in which the picture contradicts most
     sphere: SphereGeometry | None = None  # of a panorama that is not as it claims
 
 
@@ -55,5 +55,5 @@ class Case(NamedTuple):
     found: Selection  # with the alternatives that are reported
     standings: tuple[Standing, ...]  # evidence for the best pose and each alternative
     measured: Measured
-    geometry: Geometry | None = None  # if it was compared
+    geometry: Geometry | None = None  # None if it was not compared with the scan
     is_mirrored: bool = False  # the photo fits the scan better mirrored

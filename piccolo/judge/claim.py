@@ -1,4 +1,4 @@
-"""Claims about a photo's geometry, and how far to doubt them if picture and scan differ."""
+"""Claims about a photo's geometry, and how far to doubt them if the picture contradicts them."""
 
 import math
 from typing import NamedTuple
@@ -8,8 +8,8 @@ import numpy as np
 from ..system.arrays import Array
 from .consensus import MOST_LOG
 
-LEAST_CHANCE = 1e-300  # that a distribution is asked for
-MANY = 1e12  # degrees of freedom of what is known
+LEAST_CHANCE = 1e-300  # least probability whose quantile is computed
+MANY = 1e12  # degrees of freedom of a deviation that is known
 
 
 class PictureCorrections(NamedTuple):
@@ -21,15 +21,15 @@ class PictureCorrections(NamedTuple):
 
 
 class Claim(NamedTuple):
-    """Corrections (p,) of a geometry as they are expected: normally distributed, each by itself.
+    """Corrections (p,) of a geometry as they are expected: normally distributed and independent.
 
-    Some claims are wrong altogether, in one respect or another; then that correction has a larger deviation.
+    Some claims are wrong in one of the corrections, which then has a larger deviation.
     """
 
     expected: Array  # (p,)
     deviations: Array  # (p,)
-    wrong_deviations: Array  # (p,) of wrong ones
-    wrong_shares: Array  # (p,) of wrong ones among all
+    wrong_deviations: Array  # (p,) of corrections in which the claim is wrong
+    wrong_shares: Array  # (p,) of claims that are wrong in each correction, among all
 
     @property
     def precision(self) -> Array:
@@ -37,11 +37,11 @@ class Claim(NamedTuple):
         return np.asarray(self.deviations**-2.0)
 
     def contradict(self, by_picture: PictureCorrections) -> tuple[Array, Array]:
-        """Return by how many deviations each correction (p,) is wrong if only it is, and their inverse.
+        """Return by how many deviations the claim is wrong in each correction (p,), the others as claimed.
 
-        It is the score test (Rao, 1948) of each correction, the others as claimed; the inverse deviation is
-        that of the score. What few blocks tell has a deviation that is hardly known: the deviations are those
-        of a normal distribution that are as rare as what was found is by Student's.
+        It is the score test (Rao, 1948). Return also the inverse deviations (p,) of the corrections. A
+        deviation that is estimated from few blocks is itself uncertain: the score follows Student's
+        distribution, and is replaced by the score of a normal distribution that is as rare.
         """
         P = np.diag(self.precision)
         S = P - P @ np.linalg.inv(by_picture.information + P) @ P  # inverse covariance of picture less claim
@@ -52,7 +52,7 @@ class Claim(NamedTuple):
         return np.sign(scores) * as_normal(np.abs(scores) / inverse, freedom), np.asarray(inverse)
 
     def doubt(self, by_picture: PictureCorrections) -> float:
-        """Return the probability that the claim is wrong in one respect, by the odds of each."""
+        """Return the probability that the claim is wrong in one correction, by the odds of each."""
         conflicts, inverse = self.contradict(by_picture)
         wide = 1.0 + (self.wrong_deviations * inverse) ** 2  # of the variance, where it is wrong
         logs = np.minimum(0.5 * conflicts**2 * (1.0 - 1.0 / wide), MOST_LOG)
@@ -60,14 +60,14 @@ class Claim(NamedTuple):
         return odds / (1.0 + odds)
 
     def conflict(self, by_picture: PictureCorrections) -> float:
-        """Return the greatest number of deviations by which one correction is wrong."""
+        """Return the greatest number of deviations by which the claim is wrong in one correction."""
         return float(np.abs(self.contradict(by_picture)[0]).max())
 
 
 def count_variance_freedom(of_blocks: Array, weights: Array) -> Array:
     """Return the degrees of freedom (n,) of the variances of sums of corrections, weighed by (p, n).
 
-    They are those by Satterthwaite (1946) for an estimate from blocks (Bell and McCaffrey, 2002).
+    The formula is that of Satterthwaite (1946) for an estimate from blocks (Bell and McCaffrey, 2002).
     """
     parts = np.einsum("in,bij,jn->bn", weights, of_blocks, weights)
     squares = np.maximum(np.square(parts).sum(axis=0), LEAST_CHANCE)
@@ -76,8 +76,8 @@ def count_variance_freedom(of_blocks: Array, weights: Array) -> Array:
 
 
 def as_normal(deviations: Array, freedom: Array) -> Array:
-    """Return the deviations (n,) of a normal distribution that are as rare as others of Student's."""
-    from scipy.special import ndtri, stdtr  # noqa: PLC0415  # only who doubts a geometry waits for it: 0.1 s
+    """Return the deviations (n,) of a normal distribution that are as rare as those of Student's."""
+    from scipy.special import ndtri, stdtr  # noqa: PLC0415  # takes 0.1 s, and is rarely needed
 
     return np.asarray(-ndtri(np.maximum(stdtr(freedom, -deviations), LEAST_CHANCE)))
 
@@ -85,7 +85,7 @@ def as_normal(deviations: Array, freedom: Array) -> Array:
 def marginal(by_picture: PictureCorrections, claim: Claim, k: int) -> tuple[float, float]:
     """Return value and variance of one correction by the picture, the others as claimed.
 
-    The variance is infinite if the picture says nothing of it.
+    The variance is infinite if the picture does not determine it.
     """
     precision = claim.precision
     precision[k] = 1e-12

@@ -1,4 +1,4 @@
-"""Results from the case of a photo and a belief; the status follows from that (`belief.decide`)."""
+"""Results from the case of a photo and a belief; the status follows from the belief (`belief.decide`)."""
 
 import math
 from dataclasses import replace
@@ -24,7 +24,7 @@ OTHERS = {  # corrections of a lens besides its focal length, in words
     "center_y": "principal point",
     "radial": "distortion",
 }
-TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported
+TELLING_STD = 0.03  # [m] deviation of the position by the focal length: a larger one is reported
 
 
 def conclude(frame: MapFrame, case: Case, belief: Belief, min_confidence: float) -> Result:
@@ -63,11 +63,11 @@ def conclude(frame: MapFrame, case: Case, belief: Belief, min_confidence: float)
 
 
 def follow_consensus(found: Result, consensus: Opinion, min_confidence: float) -> Result:
-    """Return a photo's result, its given focal length compared with that of all photos of its camera.
+    """Compare a photo's given focal length with that of all photos of its camera; return its new result.
 
-    The doubt about what was given, and with it the confidence, follow from `consensus`. The doubt of a photo
-    that was localized with the others' focal length stays. If `consensus` contradicts what was given, every
-    result is ruled out, with a warning.
+    The doubt about the given focal length, and with it the confidence, follow from `consensus`; but a photo
+    that was localized with the others' focal length keeps its doubt. If `consensus` contradicts the given
+    focal length, the result is ruled out, with a warning.
     """
     focal = found.focal_length
     belief = found.belief
@@ -76,13 +76,13 @@ def follow_consensus(found: Result, consensus: Opinion, min_confidence: float) -
         share = focal.opinion.share_of_given(focal.prior_deviation) if focal.opinion else 1.0
         focal = replace(focal, doubt=share * consensus.doubt(focal.prior_deviation))
         belief = replace(belief, doubt=focal.doubt)
-    told = replace(found, focal_length=focal)
+    revised = replace(found, focal_length=focal)
     if consensus.conflict(focal.prior_deviation) > MOST_CONFLICT:
         px = focal.given_px * math.exp(consensus.off)
         warning = contradict("the pictures of this camera have", focal, px)
-        told = replace(told, warnings=(*told.warnings, warning))
+        revised = replace(revised, warnings=(*revised.warnings, warning))
         belief = belief.rule_out(Reason.CAMERA)
-    return told.take_belief(belief, min_confidence)
+    return revised.take_belief(belief, min_confidence)
 
 
 def contradict(who_has: str, focal: FocalLength, px: float) -> str:
@@ -97,7 +97,7 @@ def take_pose(judged: Result, fused: PoseGaussian, frame: MapFrame) -> Result:
 
 
 def explain_doubts(geometry: Geometry, status: str) -> tuple[str, ...]:
-    """Explain what a photo shows of the sphere, or how its focal length makes a pose doubtful."""
+    """Explain which part of the sphere a photo shows, or how inexact its focal length makes the position."""
     if geometry.sphere is not None:
         return (geometry.sphere.explain(),)
     focal = geometry.focal_length
@@ -111,7 +111,7 @@ def explain_doubts(geometry: Geometry, status: str) -> tuple[str, ...]:
 
 
 def explain_conflict(geometry: Geometry) -> str:
-    """Return a warning that a photo's geometry is not as it was given or claims."""
+    """Return a warning that a photo's geometry is not the one that was given or claimed."""
     focal = geometry.focal_length
     if focal is None:
         return NOT_AS_CLAIMED

@@ -9,7 +9,7 @@ from ..geometry.pose import ByValue
 from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
 from ..system.arrays import Array
 
-SAME_STD_RATIO = 1.5  # deviations that differ by less have no such direction
+SAME_STD_RATIO = 1.5  # deviations whose ratio is less are much the same in all directions
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class PoseCovariance(ByValue):
 
 
 def describe_errors(found: PoseGaussian | None, R_world_from_map: Array) -> PoseCovariance | None:
-    """Return the covariance in the world of a pose that is found in a map, whose z is up; None of none."""
+    """Return the covariance in the world of a pose in a map, whose z is up; None for None."""
     if found is None:
         return None
     in_map = found.covariance

@@ -1,4 +1,4 @@
-"""Probabilities from evidence: that each pose is right, or none of them; and the status that follows."""
+"""Probabilities from evidence, that each pose is right and that none is; and the status that follows."""
 
 import math
 from collections.abc import Sequence
@@ -16,29 +16,29 @@ NOT_LOCALIZED = "not_localized"
 
 
 class Standing(NamedTuple):
-    """Evidence for one of the poses found."""
+    """Evidence for one of a photo's poses."""
 
-    ratio: float  # what it explains, divided by what the best pose does, over what both views show
+    ratio: float  # area that it explains, divided by that of the best pose, over what both views show
     score: float  # [0, 1] what the photo's blocks explain beyond chance
-    num_matches: int | None  # local features that agree with it; None of whole views alone
+    num_matches: int | None  # local features that agree with it; None with whole views alone
     evidence: EvidenceKind
-    log_prior: float = 0.0  # log odds by what is known beforehand: lower where the pose contradicts it
-    drawn_score: float | None = None  # as the score, of edges drawn at the pose, in a scan without colours
+    log_prior: float = 0.0  # log odds by prior knowledge: lower if the pose contradicts it
+    drawn_score: float | None = None  # score of the edges drawn at the pose, in a scan without colours
 
 
 class ChoiceModel(NamedTuple):
-    """A conditional logit (McFadden, 1974): each pose, and none of them, has odds; they add up to 1."""
+    """A conditional logit (McFadden, 1974) of K + 1 answers: each of the poses, and that none is right."""
 
     weights: tuple[float, ...]  # of a pose's features
-    none_weights: tuple[float, float]  # of none of them: a constant, and log10 of the best's deviation [rad]
+    none_weights: tuple[float, float]  # of no right pose: a constant, and log10 of the best's deviation [rad]
 
 
-LEAST_STD = 0.00075  # [rad] deviations below this are taken for it: 3 mm in a large room
-MOST_STD = 0.075  # [rad] and those above this
+LEAST_STD = 0.00075  # [rad] smaller deviations count as this: 3 mm in a large room
+MOST_STD = 0.075  # [rad] larger deviations count as this
 LEAST_LOGIT_SCORE = 0.02
 LEAST_DRAWN = 0.01
 MOST_RATIO = 1.2
-CONTRADICTED_ODDS = 0.01  # odds that what the user says is wrong
+CONTRADICTED_ODDS = 0.01  # odds that the user's prior knowledge is wrong
 # By tools/benchmark.py calibration. Each feature counts in one direction only.
 FEATURES = ("log of the ratio", "log of the score", "log of the matches, or of the drawn score")
 NONE_FEATURES = ("constant", "log10 of the largest deviation [rad]")
@@ -69,7 +69,7 @@ def log_odds(standing: Standing, method: Method = METHOD, model: ChoiceModel | N
 def none_features(std: float | None) -> Array:
     """Return the features (2,) of the odds that no pose is right, as NONE_FEATURES names them.
 
-    `std` is the largest deviation [rad] of the best pose by image and scan; None where it is not known.
+    `std` is the largest deviation [rad] of the best pose by image and scan; None if it is not known.
     """
     return np.array([1.0, math.log10(min(max(std or MOST_STD, LEAST_STD), MOST_STD))])
 
@@ -83,8 +83,9 @@ def posterior(
     """Return the probabilities (K + 1,) that the place of each of K poses is right, and that none of them is.
 
     `std_of_fit` is the largest deviation of the best position with an exact focal length, as an angle [rad].
-    The default model is that of the poses' evidence. Calibrated for queries of which half were taken in the
-    scan. That no place is right is more likely if the photo fits nearly as well beside the best pose.
+    The default model is that of the poses' kind of evidence. It is calibrated for photos of which half were
+    taken in the scan. The larger the deviation, the likelier it is that no place is right: the photo then
+    fits nearly as well a little away from the best pose.
     """
     model = model or MODELS[standings[0].evidence]
     logits = [log_odds(standing, method, model) for standing in standings]
@@ -95,7 +96,7 @@ def posterior(
 
 
 def classify(probabilities: Array, min_confidence: float) -> str:
-    """Return the status for probabilities (K + 1,); ambiguous if only the poses together are likely."""
+    """Return the status for probabilities (K + 1,): ambiguous if the poses are likely only all together."""
     if probabilities[0] >= min_confidence:
         return LOCALIZED
     return AMBIGUOUS if 1.0 - probabilities[-1] >= min_confidence else NOT_LOCALIZED

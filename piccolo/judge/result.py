@@ -61,7 +61,7 @@ class Result:
     probability_none
         Probability that neither `best_pose` nor an alternative is right; None if the photo was not read.
     belief
-        `Belief`, of which the probabilities are products; of nothing if the photo was not read.
+        `Belief`, from which the probabilities follow; `NOTHING` if the photo was not read.
     alternatives
         Other poses that explain the photo, best first, at most 5.
     evidence
@@ -80,16 +80,16 @@ class Result:
     source
         Digests of scan and photo, the photo's size and capture time.
     cameras, focal_length
-        Cameras of a photo that is no sphere; the estimate of a focal length that is not exact.
+        Cameras of a photo that is no sphere; the estimate of its focal length if the given one is not exact.
     sphere
-        What a panorama shows of the sphere, if the scan says that it is not what it claims.
+        The part of the sphere that a panorama shows, if the scan contradicts the part that it claims.
     gps_prior
         Where the photo's GPS position lies in the scan, if both are known.
     walk
         For a frame of a walk, how its pose was found. Status, pose and covariance are then those of the walk.
     beside
-        For a photo that was not sure alone, the photos of the batch beside which it was looked at again; of
-        photos of one place, those that it was localized with.
+        For a photo that was not sure alone, the photos of the batch beside which it was localized again; for
+        a photo of a group, the photos with which it was localized together.
     seconds
         Time [s] spent on this photo, by stage.
     settings, warnings
@@ -123,7 +123,7 @@ class Result:
     walk: WalkFrame | None = None
     beside: Beside | None = None
     belief: Belief = NOTHING
-    # what the method hands on until the result is complete; no file has it, no user sees it
+    # values that the method hands on until the result is complete; they are not written to files
     gaussian: PoseGaussian | None = field(default=None, compare=False, repr=False)  # of the pose, in the map
     # [rad] largest deviation of the position if focal length and stitching were exact
     std_of_fit: float | None = field(default=None, compare=False, repr=False)
@@ -131,7 +131,7 @@ class Result:
     standings: tuple[Standing, ...] = field(default=(), compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Make the arrays read-only, on which the JSON and the hash rest."""
+        """Make the arrays read-only, as the JSON and the hash depend on them."""
         for part in (*self.poses, *filter(None, [self.covariance])):
             part.freeze()
 
@@ -144,7 +144,7 @@ class Result:
 
     @property
     def is_believed(self) -> bool:
-        """Return True if anything is believed of the photo, be it that no pose was found."""
+        """Return True if there is a belief, even if it is that no pose was found."""
         return self.probability_none is not None or self.belief != NOTHING
 
     @property
@@ -174,12 +174,12 @@ class Result:
 
     @property
     def hint(self) -> str | None:
-        """Which accuracy would accept a pose whose place is certain, on one line; None for all else."""
+        """A line with the accuracy that would accept a pose whose place is certain; None if there is none."""
         asked = self.settings.get("accuracy")
         if self.status == LOCALIZED or self.covariance is None or not asked:
             return None
         doubt = self.belief.doubt
-        if self.focal_length is not None:  # what a photo can't confirm is less if it needn't be so exact
+        if self.focal_length is not None:  # a focal length that need not be so exact is confirmed more easily
             doubt = max(1.0 - (1.0 - doubt) / (1.0 - UNCONFIRMED), 0.0)
         demand = Demand(Accuracy(**asked), self.settings["min_confidence"])
         return explain_accuracy(self.place_probability * (1.0 - doubt), self.covariance, demand)
@@ -190,7 +190,7 @@ class Result:
         return self.cloud if isinstance(self.cloud, str) else ", ".join(self.cloud)
 
     def take_belief(self, belief: Belief, min_confidence: float) -> "Result":
-        """Return this with what is believed of its pose and its alternatives, and the status that follows."""
+        """Return the result with a belief in its pose and alternatives, and the status that follows."""
         status, probabilities = decide(belief, min_confidence)
         *of_poses, none = probabilities.tolist()
         pairs = zip(self.alternatives, of_poses[1:], strict=True)
@@ -204,7 +204,7 @@ class Result:
         )
 
     def complete(self, blank: "Result") -> "Result":
-        """Return this as the result of a photo of which a blank result says what it is about."""
+        """Return the result with the names of files, settings and digests that a blank result has."""
         return replace(
             self,
             cloud=blank.cloud,
@@ -310,7 +310,7 @@ class Result:
     @classmethod
     def from_json(cls, text: str) -> "Result":
         """Return the result that `to_json` wrote. Raises InputError for any other text."""
-        from msgspec import convert  # noqa: PLC0415  only who reads results waits for it
+        from msgspec import convert  # noqa: PLC0415  only reading results needs it
 
         with reading_document(text, FORMAT, "result") as document:
             walk = document["walk"]

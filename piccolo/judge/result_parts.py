@@ -1,4 +1,4 @@
-"""The parts of a photo's result: evidence, alternatives, what a camera or a walk tells."""
+"""The parts of a photo's result: evidence, alternatives, its camera, its place in a walk."""
 
 import math
 from dataclasses import dataclass, replace
@@ -11,23 +11,23 @@ WIDE = 0.05  # a focal length with a larger deviation is a guess: k1 is fitted t
 
 @dataclass(frozen=True)
 class Evidence:
-    """The measurements that a confidence rests on."""
+    """The measurements from which a confidence is computed."""
 
     score: float  # [0, 1] what the photo's blocks explain beyond chance; of preset paper, Agreement.score
-    # lead over the best pose elsewhere in what both views show, divided by what this pose explains there; 1
-    # if there is no pose elsewhere; of preset paper, score less that of the best pose elsewhere
+    # lead over the best pose elsewhere, as a share of the area that this pose explains, over what both views
+    # show; 1 if there is no pose elsewhere; of preset paper, score less that of the best pose elsewhere
     margin: float
     agreement: float  # correlation over what both show, charged where that is under half of the sphere
     explained_fraction: float  # of what the panorama shows, by solid angle, see Occlusion
     seen_fraction: float  # of the sphere, on which both show anything
     contradicted_fraction: float = 0.0  # of what the panorama shows; what is left was not scanned
-    num_matches: int | None = None  # local features of the photo that agree with the pose; None: not asked
+    num_matches: int | None = None  # local features of the photo that agree with the pose; None: not counted
     alternative_matches: int | None = None  # the most that agree with a pose elsewhere
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """A pose elsewhere that was found too, in world coordinates."""
+    """Another pose of a photo, at another place, in world coordinates."""
 
     pose: Pose
     score: float  # as of Evidence
@@ -44,21 +44,21 @@ class FocalLength:
     std_px: float
     given_px: float
     given_std_px: float
-    picture_px: float | None = None  # by the photo and the scan alone; None if they tell nothing
+    picture_px: float | None = None  # by the photo and the scan alone; None if they do not determine it
     picture_std_px: float | None = None
-    doubt: float = 0.0  # probability that what was given is wrong and has pulled this along
-    source: str = ""  # of what was given: the option, or EXIF
-    others_px: float | None = None  # by other photos of the camera, where that was taken for the one given
+    doubt: float = 0.0  # probability that the given one is wrong and has pulled this one along
+    source: str = ""  # of the given one: the option, or EXIF
+    others_px: float | None = None  # by other photos of the camera, where used in place of the given one
     others_std_px: float | None = None
 
     @property
     def prior_deviation(self) -> float:
-        """Standard deviation of the logarithm of what was given."""
+        """Standard deviation of the logarithm of the given focal length."""
         return self.given_std_px / self.given_px
 
     @property
     def is_guess(self) -> bool:
-        """True if what was given is hardly more than a guess."""
+        """True if the given focal length is hardly more than a guess."""
         return self.prior_deviation > WIDE
 
     @property
@@ -70,7 +70,7 @@ class FocalLength:
         return Opinion(off, (self.picture_std_px / self.picture_px) ** 2)
 
     def update(self, found: "FocalLength | None") -> "FocalLength":
-        """Return this with what a later fit found; what was given and what the photo said alone stay."""
+        """Return the focal length of a later fit, with the given one and the photo's own estimate kept."""
         return self if found is None else replace(self, px=found.px, std_px=found.std_px, doubt=found.doubt)
 
 
@@ -84,7 +84,7 @@ class SphereGeometry:
     std_deg: tuple[float, float, float]  # deviations of these
 
     def explain(self) -> str:
-        """Say in a line what the panorama shows."""
+        """Return a line that says which part of the sphere the panorama shows."""
         shown = f"the panorama shows {self.width_deg:.1f} x {self.height_deg:.1f} of 360 x 180 degrees"
         horizon = abs(self.horizon_deg)
         side = "below" if self.horizon_deg > 0.0 else "above"
@@ -93,7 +93,7 @@ class SphereGeometry:
 
 @dataclass(frozen=True)
 class Source:
-    """Which scan and which photo a result is of; None where that is not known."""
+    """The scan and the photo of a result; None where that is not known."""
 
     cloud_sha256: str | None = None  # of the scan's file; of several, of their sorted digests, one a line
     pano_sha256: str | None = None  # of the photo's file; of cube faces, of their digests in order
@@ -103,16 +103,16 @@ class Source:
 
 @dataclass(frozen=True)
 class Beside:
-    """A second look at a photo, beside others of a batch; or those that it was localized together with."""
+    """The photos beside which a photo was localized again, or with which it was localized together."""
 
-    photos: tuple[str, ...]  # paths of those that show the same, those with the most matches first
-    asked_sha256: str  # digest of all that were asked
-    is_together: bool = False  # those that were taken with it were asked together
+    photos: tuple[str, ...]  # paths of the photos that show the same, those with the most matches first
+    asked_sha256: str  # digest of all photos that might have shown the same
+    is_together: bool = False  # it was localized together with photos that were taken with it
 
 
 @dataclass(frozen=True)
 class Gap:
-    """A part of a walk that nobody can have walked: a lift, a cut, a camera in a pocket."""
+    """A part of a walk that is too long for its time: a lift, a cut, a camera in a pocket."""
 
     distance: float  # [m]
     seconds: float
@@ -120,7 +120,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class Alone:
-    """The result of a frame localized alone."""
+    """The result of a frame that was localized without the other frames."""
 
     status: str
     confidence: float
@@ -134,5 +134,5 @@ class WalkFrame:
     time: float  # [s] from the walk's beginning; of frames without times their number
     frame: int  # from 0
     how: str  # where its pose comes from: "alone", "tracked", "near", or "none"
-    alone: Alone | None  # if it was searched without regard to the others
-    gap: Gap | None  # before it; None without times
+    alone: Alone | None  # None if it was not localized without the other frames
+    gap: Gap | None  # before the frame; None if there is none, or the frames have no times

@@ -22,10 +22,10 @@ def rank(candidates: Sequence[Candidate]) -> Selection:
 
 
 def list_drawn(profile: Profile, ranked: Sequence[Candidate]) -> list[bool]:
-    """Say at which of ranked candidates the scan must be drawn: the best, and those that could still beat it.
+    """Return True for candidates at which the scan must be drawn: the best, and those that may beat it.
 
-    The best comes first; its matches must be known. A pose that explains far less than one with which many
-    features agree can't win.
+    The best comes first; its matches must be known. A pose can't win if it explains far less than a pose with
+    which many features agree.
     """
     if not profile.uses_matches:
         return [False] * len(ranked)
@@ -39,13 +39,13 @@ def list_drawn(profile: Profile, ranked: Sequence[Candidate]) -> list[bool]:
 
 
 def count_matches(profile: Profile, ranked: Sequence[Candidate]) -> list[int]:
-    """Return the matches of ranked candidates, the best first; 0 of those that can't win."""
+    """Return the number of matches of each ranked candidate, the best first; 0 of those that can't win."""
     counts = zip(ranked, list_drawn(profile, ranked), strict=True)
     return [(h.num_matches or 0) if is_rival else 0 for h, is_rival in counts]
 
 
 def assess_alone(profile: Profile, ranked: Sequence[Candidate]) -> list[Standing]:
-    """Return the evidence for each of several candidates by itself, the best first.
+    """Return the evidence for each of several candidates, not yet relative to the best, which is the first.
 
     Poses that contradict the prior share the odds that the prior is wrong.
     """
@@ -63,14 +63,14 @@ def assess_alone(profile: Profile, ranked: Sequence[Candidate]) -> list[Standing
 
 
 def assess(profile: Profile, found: Selection) -> list[Standing]:
-    """Return the evidence for the best candidate and for others, compared over what both views show."""
+    """Return the evidence for each candidate, compared with the best over the area that both views show."""
     ratios = [1.0, *(h.comparison.compute_ratio(found.best.comparison) for h in found.alternatives)]
     alone = assess_alone(profile, found.candidates)
     return [standing._replace(ratio=ratio) for standing, ratio in zip(alone, ratios, strict=True)]
 
 
 def select(profile: Profile, found: Selection) -> Selection:
-    """Select the candidate with the greatest odds, each pair compared over what both views show.
+    """Select the candidate with the greatest odds, each pair compared over the area that both views show.
 
     Each pair is compared over another part of the sphere, so three poses may beat each other in turn. The
     best is the one that is beaten least (minimax; Simpson 1969, Kramer 1977); the others follow by odds.
@@ -108,14 +108,14 @@ def is_clear(profile: Profile, found: Selection) -> bool:
 
 
 def is_faint(profile: Profile, found: Selection) -> bool:
-    """Return True if all are faint and no more features agree than by chance: refinement soon ends."""
+    """Return True if all scores are faint and no more features agree than by chance: refinement soon ends."""
     if max(h.score for h in found.candidates) >= profile.method.faint_score:
         return False
     return max(count_matches(profile, found.candidates)) <= profile.method.chance_matches
 
 
 def explains_more(method: Method, mirrored: Candidate, own: Candidate) -> bool:
-    """Return True if a mirrored photo explains more; in a symmetric scene both are about equal."""
+    """Return True if the mirrored photo is explained better; in a symmetric scene both are about equal."""
     return mirrored.score > method.mirror_ratio * own.score
 
 
@@ -129,8 +129,8 @@ def is_mirrored(method: Method, own: Candidate, mirrored: Candidate | None) -> b
 def credit_copies(standings: Sequence[Standing], is_copy: Sequence[bool]) -> list[Standing]:
     """Give every copy of a place the greatest number of matches among the copies.
 
-    How many agree tells how well a copy was scanned, not which of them it is. So do edges: in a scan without
-    colours every copy has the best pose's evidence.
+    The number of matches depends on how well a copy was scanned, not on whether the photo was taken there.
+    The same holds for edges: in a scan without colours every copy gets the best pose's evidence.
     """
     if standings[0].evidence == "shape":
         best = standings[0]

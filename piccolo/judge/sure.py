@@ -1,14 +1,12 @@
-"""Thresholds of the odds that a pose is right: from which it is sure enough for what.
+"""Thresholds of the probability that a pose is right, from which it is used or shown.
 
-What counts as localized is the user's `accuracy` and `min_confidence`. Thresholds of scores are in
-`problem.method`.
+Whether a photo is localized follows from the user's `accuracy` and `min_confidence`. Thresholds of scores are
+in `problem.method`.
 """
 
 from ..problem.method import METHOD
 
-SURE_ODDS = METHOD.sure_odds  # [log] a frame or a photo with them helps others
-SURE_CONFIDENCE = 0.95  # about the same of a confidence
-WORTH_A_LOOK = 0.1  # probability of the place: below it a user is not asked to look at the best pose
-SHOWN = (
-    0.05  # probability of the place of a photo that is not localized: below it no plan shows its best pose
-)
+SURE_ODDS = METHOD.sure_odds  # [log] least odds of a frame or a photo by which others are placed
+SURE_CONFIDENCE = 0.95  # about the same threshold as a confidence
+WORTH_A_LOOK = 0.1  # probability of a place: below it, no message asks the user to look at the best pose
+SHOWN = 0.05  # probability of a place: below it, no plan shows the best pose of a photo that is not localized

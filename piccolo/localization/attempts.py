@@ -65,7 +65,7 @@ def plan_attempts(problem: Problem) -> list[tuple[Problem, Attempt]]:
         first.append((problem, look_along_walls))
     by_views: list[tuple[Problem, Attempt]] = []
     if profile.is_always_upright or problem.gravity != "unknown":
-        upright: Tilts = "known" if problem.photo.has_tilt else profile.untold_tilt
+        upright: Tilts = "known" if problem.photo.has_tilt else profile.default_tilt
         if profile.is_narrow:
             by_views.append((problem, partial(search_briefly, tilts=upright)))
         by_views.append((problem, partial(search_views, tilts=upright)))
@@ -141,7 +141,7 @@ def search_features(problem: Problem, known: list[Candidate], means: Means) -> t
 
 def propose_level(problem: Problem, matches: Matches, workers: Workers) -> list[MatchedPose]:
     """Return poses from feature matches, best first; level ones only if the tilt is known."""
-    has_exact_tilt = problem.photo.has_tilt or problem.profile.untold_tilt == "known"
+    has_exact_tilt = problem.photo.has_tilt or problem.profile.default_tilt == "known"
     is_level = problem.gravity == "known" and has_exact_tilt
     up_cam = problem.photo.R_cam_from_level[:, 2]
     found = propose_poses(matches, problem.method.most_matched, workers)
