@@ -1,6 +1,6 @@
 """Photos of a batch that are not sure, localized together with those that were taken with them.
 
-A photo that is sure is not searched again: its pose is where the others follow from.
+A photo that is sure is not searched again: the poses of the others follow from its pose.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -27,12 +27,14 @@ from .members import Member, Shot, check_photos, find_alone
 
 
 class Known(NamedTuple):
-    """A photo, and what is known of it."""
+    """A photo with its result so far."""
 
-    take: Callable[[], Panorama | None]  # by its refined camera, if it is sure; None if it is another
+    take: Callable[
+        [], Panorama | None
+    ]  # reads it, if it is sure with its refined camera; None if it has changed
     settings: CoarseToFineSettings
     result: Result
-    is_open: bool  # it is not sure
+    is_open: bool  # the photo is not sure
 
 
 @one_blas_thread()
@@ -41,12 +43,12 @@ def localize_among(
 ) -> dict[int, Grouped]:
     """Localize photos that are not sure with those whose pictures match theirs.
 
-    Returns those that are found by others, by their numbers. A photo that is not sure is searched again if
-    others put it anywhere.
+    Returns the results of those that were found by others, by their numbers. A photo that is not sure is
+    searched again if its matches with others give it any pose.
     """
     keypoints = {k: list_keypoints(scan_map, photo, workers, watch) for k, photo in enumerate(photos)}
     with watch.stage("match"):
-        numbers = list_asked(keypoints, {k for k, photo in enumerate(photos) if photo.is_open}, workers)
+        numbers = list_matched(keypoints, {k for k, photo in enumerate(photos) if photo.is_open}, workers)
     if not numbers:
         return {}
     check_photos(len(numbers))
@@ -70,7 +72,7 @@ def localize_among(
 
 
 def list_keypoints(scan_map: ScanMap, photo: Known, workers: Workers, watch: Stopwatch) -> Keypoints | None:
-    """Return a photo's keypoints; None if it is not searched, or not by them."""
+    """Return a photo's keypoints; None if the photo can't be searched, or is searched without keypoints."""
     panorama = photo.take()
     if panorama is None:
         return None
@@ -81,15 +83,15 @@ def list_keypoints(scan_map: ScanMap, photo: Known, workers: Workers, watch: Sto
         return problem.photo.seen(workers).keypoints
 
 
-def list_asked(keypoints: Mapping[int, Keypoints | None], unsure: set[int], workers: Workers) -> list[int]:
-    """List photos that are not sure, and those with which they are linked by matches enough to place them."""
+def list_matched(keypoints: Mapping[int, Keypoints | None], unsure: set[int], workers: Workers) -> list[int]:
+    """List photos that are not sure, and those to which they have enough matches to be placed by them."""
     given = {k: one for k, one in keypoints.items() if one is not None}
     pairs = [two for two, (mine, _) in match_each(given, workers).items() if len(mine) >= FIRM.least]
     return sorted({k for two in pairs if not unsure.isdisjoint(two) for k in two})
 
 
 def recall_found(scan_map: ScanMap, photo: Known, workers: Workers, watch: Stopwatch) -> Member | None:
-    """Return a photo as it was found, by its result; None if it is another, or nothing is known."""
+    """Return a photo as it was found, from its result; None if its file has changed, or it has no pose."""
     panorama = photo.take()
     result = photo.result
     problem = panorama and prepare_search(scan_map, panorama, photo.settings, watch)
@@ -106,7 +108,7 @@ def recall_found(scan_map: ScanMap, photo: Known, workers: Workers, watch: Stopw
 
 
 def search_again(scan_map: ScanMap, photo: Known, means: Means) -> Member | None:
-    """Search a photo again by itself; None if it is another."""
+    """Search a photo again by itself; None if its file has changed."""
     panorama = photo.take()
     if panorama is None:
         return None
@@ -114,7 +116,7 @@ def search_again(scan_map: ScanMap, photo: Known, means: Means) -> Member | None
 
 
 def list_placed(members: Mapping[int, Member], unsure: set[int], workers: Workers) -> set[int]:
-    """List the photos that are not sure that follow from those that are, or from each other's own poses."""
+    """List the unsure photos whose poses follow from those of sure photos, or from each other's own poses."""
     links = find_links({k: member.found.problem for k, member in members.items()}, workers)
 
     def place(number: int, rank: int = 0) -> Placed:

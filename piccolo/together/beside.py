@@ -1,7 +1,8 @@
 """A second look at a photo that is not sure, beside others that are.
 
 Photos taken near each other show the same things in the same light, more alike than the scan drawn there. The
-keypoints of the sure ones get their ranges from the scan, and their matches with the photo's give its pose.
+keypoints of the sure photos get their ranges from the scan, and the matches of the unsure photo with these
+keypoints give its pose.
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,7 +37,7 @@ from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
 from ..system.jobs.threads import Stopwatch, Workers, one_blas_thread
 
-MOST_BESIDE = 3  # photos whose matches count, those with the most
+MOST_BESIDE = 3  # photos beside, those with the most matches
 
 
 class SurePhoto(NamedTuple):
@@ -48,7 +49,7 @@ class SurePhoto(NamedTuple):
 
 
 class Neighbor(NamedTuple):
-    """A photo that shows what another shows."""
+    """A sure photo that shows the same things as the photo that is localized, here called the query."""
 
     name: str
     picture: SurePhoto
@@ -71,7 +72,7 @@ def place_sure(
 
 
 def recall_gaussian(problem: Problem, pose: Pose, covariance: PoseCovariance | None) -> PoseGaussian | None:
-    """Return a photo's pose in the map with its errors; those of the scan are common."""
+    """Return a photo's pose in the map with its errors; those of the scan are common to all photos."""
     if covariance is None:
         return None
     in_map = turn_positions(covariance.matrix, problem.scan_map.R_map_from_world)
@@ -90,8 +91,9 @@ def localize_beside(
 ) -> tuple[Result, tuple[str, ...]]:
     """Localize a photo of a part of the sphere by others that are sure, given by their names.
 
-    `known` are poses in the map that were found for it alone. Returns the result and the names of those that
-    show the same; without any the result is empty. It is no surer than the surest of them.
+    `known` are poses in the map that were found for the photo alone. Returns the result, and the names of the
+    pictures that show the same things; if there are none, the result is empty. The photo is no surer than the
+    surest of these pictures.
     """
     allowed_map = apply_prior(scan_map, settings.prior)
     with watch.stage("match"):
@@ -130,7 +132,7 @@ def list_agreeing(
     matches: Sequence[Matches],
     scan_map: ScanMap,
 ) -> list[Neighbor]:
-    """List the photos whose matches (rays by the final camera) put a photo where it is by all evidence."""
+    """List the neighbours whose matches (with rays by the final camera) confirm the pose of the result."""
     if judged.best_pose is None:
         return []
     own = scan_map.from_world(judged.best_pose)
@@ -143,7 +145,7 @@ def list_agreeing(
 
 
 def confirm(matches: Matches, own: Pose, least: int) -> Pose | None:
-    """Return a photo's pose by its matches with another; None if fewer than `least` confirm its own."""
+    """Return a photo's pose by its matches with another; None if fewer than `least` confirm its `own`."""
     exact = exact_pose(matches, own)
     is_confirmed = exact and exact.num_matches >= least and CONFIRMED.holds(exact.pose, own)
     return exact.pose if exact and is_confirmed else None
@@ -155,10 +157,10 @@ def attach_by_matches(of_other: PoseGaussian, pose: Pose, matches: Matches) -> P
 
 
 def fuse(judged: Result, other: Neighbor, ended: Found) -> PoseGaussian | None:
-    """Return the mean of a result's own pose and of that by the photo beside, in the map.
+    """Return the mean of a result's own pose and of the pose by the photo beside, in the map.
 
-    Errors of the focal length and of the scan are common to both. None for a result that is ruled out, and if
-    the mean would contradict the prior.
+    Errors of the focal length and of the scan are common to both poses. None if the result is ruled out, or
+    if the mean would contradict the prior.
     """
     own = judged.gaussian
     of_photo = other.picture.gaussian
@@ -173,9 +175,9 @@ def fuse(judged: Result, other: Neighbor, ended: Found) -> PoseGaussian | None:
 def match_picture(
     problem: Problem, workers: Workers, named: tuple[str, SurePhoto]
 ) -> tuple[Neighbor, int] | None:
-    """Match a photo with another, given with its name; None if fewer agree than a sure pose has.
+    """Match a photo with another, given with its name; return the neighbour and how many matches agree.
 
-    Returns also the number of those that agree.
+    None if fewer agree than a sure pose has.
     """
     name, picture = named
     matches = match_beside(problem, picture.located, workers)

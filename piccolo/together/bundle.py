@@ -2,8 +2,9 @@
 
 Each photo is searched by itself. Its poses vote for poses of the bundle, and the best few of these are tested
 in every photo. Then the bundle, its scale and the errors of the relative poses are adjusted to the poses of
-single photos, and each photo's pose is what it and the others say together. A photo that contradicts the
-others keeps its own result; if the relative poses contradict photos that are sure, only these keep theirs.
+single photos, and each photo gets the mean of its own pose and the one that the others expect. A photo that
+contradicts the others keeps its own result. If the relative poses contradict photos that are sure, these keep
+their results, and the others get none.
 """
 
 import math
@@ -49,9 +50,9 @@ from .bundle_search import PosedMember, Support, find_supports, propose_bundles,
 from .members import Member, Shot, find_members
 
 EVEN_ODDS = 0.5
-NUM_EXCHANGED = 8  # chosen: photos whose relative pose another may have by mistake
-MOST_GAIN = 3.0  # [log] by being where it was to be expected
-TOLD = 2.0  # deviations of the scale, and ratio of other errors to those expected, that are reported
+NUM_EXCHANGED = 8  # chosen: photos whose relative poses a photo may have got by mistake
+MOST_GAIN = 3.0  # [log] that a photo gains at most by being where it was expected
+REPORTED_ERRORS = 2.0  # deviations of the scale, and ratio of other errors to the expected: more are reported
 NOT_FOUND = "`relative_poses`: no pose of all photos together was found"
 DOUBTED = "`relative_poses`: they contradict the photos that are sure; only these keep their poses"
 UNSEEN = "`relative_poses`: this photo does not show the place where the others put it"
@@ -63,8 +64,8 @@ class Agreed(NamedTuple):
 
     adjusted: Adjusted
     errors: RelativeErrors
-    estimates: dict[int, Estimate]  # own poses of the photos that agree with it
-    apart: frozenset[int]  # photos that contradict it
+    estimates: dict[int, Estimate]  # own poses of the photos that agree with the bundle
+    apart: frozenset[int]  # photos that contradict the bundle
     warnings: tuple[str, ...]
 
 
@@ -81,9 +82,10 @@ class Posed(NamedTuple):
 def localize_bundle(
     scan_map: ScanMap, posed: Sequence[Posed], workers: Workers, watch: Stopwatch, errors: RelativeErrors
 ) -> list[Result]:
-    """Localize photos together; those of all settings but their priors and traces are alike.
+    """Localize photos together; their settings are alike, but for priors and traces.
 
-    `errors` are those expected of the poses; their scale is unknown if its deviation is large.
+    `errors` are the expected errors of the relative poses; a large deviation of the scale stands for an
+    unknown one.
     """
     shots = [Shot(one.panorama, one.settings, one.trace) for one in posed]
     alone, found, _ = find_members(scan_map, shots, workers, watch)
@@ -115,7 +117,9 @@ def judge_members(
         return {k: refuse(member, reason) for k, member in members.items()}
     supports = tested[best]
     agreed = agree(members, bundles[best], supports, errors)
-    if not isinstance(agreed, str):  # photos that were not found are refined again from where they now belong
+    if not isinstance(
+        agreed, str
+    ):  # photos that were not found are refined again, from the pose that the others expect
         near = agreed.adjusted.bundle
         supports |= {
             k: find_supports(
@@ -140,7 +144,7 @@ def judge_members(
 
 
 def list_neighbors(members: dict[int, PosedMember], k: int) -> list[Pose]:
-    """Return the relative poses of the photos next to one in order, which may be its own by mistake."""
+    """Return the relative poses of the photos next in order to photo `k`, which it may have got by mistake."""
     others = sorted((j for j in members if j != k), key=lambda j: abs(j - k))
     return [members[j].cam_from_bundle for j in others[:NUM_EXCHANGED]]
 
@@ -148,10 +152,10 @@ def list_neighbors(members: dict[int, PosedMember], k: int) -> list[Pose]:
 def agree(
     members: dict[int, PosedMember], bundle: Bundle, supports: dict[int, Support], errors: RelativeErrors
 ) -> Agreed | str:
-    """Adjust the bundle to the photos whose own poses agree with it; a text says why it is not believed.
+    """Adjust the bundle to photos whose own poses agree with it; return a text if it is not believed.
 
-    The errors of the relative poses are estimated from the photos' own poses. Then own poses get the errors
-    of local optima too, as far as they may be such.
+    The errors of the relative poses are estimated from the photos' own poses. Then each own pose gets the
+    errors of a local optimum too, in proportion to the probability that it is one.
     """
     own = {
         k: Estimate(support.gaussian, members[k].cam_from_bundle)
@@ -176,9 +180,9 @@ def agree(
     blurred = blur_local(bundle, own, {k: supports[k].local_share for k in own}, errors)
     adjusted = adjust(bundle, list(blurred.values()), errors)
     warnings = []
-    if abs(adjusted.bundle.log_scale) > TOLD * expected.log_scale:
+    if abs(adjusted.bundle.log_scale) > REPORTED_ERRORS * expected.log_scale:
         warnings.append(f"`relative_poses`: positions are {describe_scale(adjusted.bundle.log_scale)}")
-    if errors.turn > TOLD * expected.turn or errors.move > TOLD * expected.move:
+    if errors.turn > REPORTED_ERRORS * expected.turn or errors.move > REPORTED_ERRORS * expected.move:
         text = f"{errors.move:.2f} m and {math.degrees(errors.turn):.1f} deg"
         warnings.append(f"`relative_poses`: they are off by about {text} each")
     apart = (every - frozenset(own)) & frozenset(sure)
@@ -190,8 +194,8 @@ def blur_local(
 ) -> dict[int, Estimate]:
     """Add the errors of local optima to the photos' own poses, times the probability that each is one.
 
-    It begins as `local_shares`, and is less if the pose is near the one that the others expect. Poses and
-    probabilities are found in turn (expectation maximization).
+    This probability begins as in `local_shares`, and decreases if the pose is near the one that the others
+    expect. Poses and probabilities are computed in turn (expectation maximization).
     """
     shares = local_shares
     for _ in range(NUM_ADJUSTMENT_ROUNDS):
@@ -207,7 +211,7 @@ def blur_local(
 
 
 def describe_scale(log_scale: float) -> str:
-    """Say how far positions are too long or too short, by the log of the scale that corrects them."""
+    """Describe how far distances are too long or too short, by the log of the scale that corrects them."""
     percent = 100.0 * abs(math.expm1(-log_scale))
     return f"{percent:.0f} % too {'short' if log_scale > 0.0 else 'long'}"
 
@@ -218,7 +222,7 @@ def judge_apart(member: Member, reason: str) -> Result:
 
 
 def refuse(member: Member, reason: str) -> Result:
-    """Return a photo's own result if it is sure, else none, with the reason."""
+    """Return a photo's own result if it is sure, else a result without a pose, with the reason."""
     if member.alone.status == LOCALIZED:
         return judge_apart(member, reason)
     return nothing_found(*member.alone.warnings, reason)
@@ -227,9 +231,9 @@ def refuse(member: Member, reason: str) -> Result:
 class Placement(NamedTuple):
     """The pose of a photo among others."""
 
-    gaussian: PoseGaussian | None  # in the map; None if neither the photo nor others tell it
+    gaussian: PoseGaussian | None  # in the map; None if neither the photo nor the others determine it
     shares: Shares
-    expected: PoseGaussian | None  # by the others
+    expected: PoseGaussian | None  # the pose by the others alone
 
 
 def place_member(member: PosedMember, number: int, shares: Shares, agreed: Agreed) -> Placement:
@@ -267,7 +271,8 @@ def judge_member(
 ) -> Result:
     """Return the result of a photo in a bundle that is believed.
 
-    `elsewhere` are the other poses of the bundle; `probabilities` (K + 1,) are of all of them, and of none.
+    `elsewhere` are the other poses of the bundle; `probabilities` (K + 1,) are those of all poses of the
+    bundle, this one first, and of none.
     """
     if member.alone.belief.ruled_out and not member.is_misplaced:
         return replace(member.alone, warnings=member.alone.warnings + agreed.warnings)
@@ -296,8 +301,9 @@ def judge_placed(
 ) -> Result:
     """Return the result of a photo that is placed by itself and by others.
 
-    `is_agreed` if its own pose agrees with theirs. `elsewhere` are the poses that the photo has if the photos
-    together are at other places; `probabilities` (K + 1,) are of all of these places, and of none.
+    `is_agreed` is True if its own pose agrees with the others. `elsewhere` are the photo's poses if all
+    photos were taken at another place; `probabilities` (K + 1,) are those of all places, this one first, and
+    of none.
     """
     gaussian, shares, expected = placed
     assert gaussian is not None
@@ -314,10 +320,10 @@ def judge_placed(
 
 
 def merge_places(pose: Pose, elsewhere: Sequence[Pose], probabilities: Array) -> tuple[list[Pose], Array]:
-    """Merge poses that are one for a photo, though others of its bundle differ; add up their probabilities.
+    """Merge a photo's poses that are the same though the bundle differs; add up their probabilities.
 
-    `probabilities` (K + 1,) are of the pose, of those elsewhere, and of none. Returns those that are left
-    elsewhere, and the probabilities.
+    `probabilities` (K + 1,) are those of `pose`, of the poses `elsewhere`, and of none. Returns the poses
+    elsewhere that are left, and the probabilities.
     """
     places = [pose]
     sums = [float(probabilities[0])]
@@ -338,9 +344,10 @@ def weigh_local(share: float, expected: PoseGaussian | None, own: PoseGaussian) 
 
 
 def compare_errors(expected: PoseGaussian, own: PoseGaussian) -> float:
-    """Return the likelihood ratio of a photo's own pose, as far as it is from the one expected.
+    """Return the likelihood ratio of a photo's own pose, by its distance from the expected one.
 
-    It is right, or a local optimum of the loss near the right one, which has further errors.
+    The ratio is that of a right pose against a local optimum of the loss near the right one, which has
+    further errors.
     """
     step = subtract(own.pose, expected.pose)
     right = expected.own + own.own
@@ -354,7 +361,7 @@ def compare_errors(expected: PoseGaussian, own: PoseGaussian) -> float:
 def recalibrate_at(
     member: Member, support: Support, pose: Pose, elsewhere: Sequence[Pose], workers: Workers
 ) -> Found:
-    """Return a photo's poses by all photos: `pose`, and those that it has elsewhere.
+    """Return a photo's poses by all photos: `pose`, and the poses `elsewhere`.
 
     The focal length, if it is not exact, is fitted at the photo's own pose.
     """

@@ -29,12 +29,12 @@ from ..system.arrays import Array
 from ..system.jobs.threads import Workers
 from .members import Member
 
-MOST_UNSEEN = 1.0 / 3.0  # chosen: of photos, those that may show nothing
-SILENT = 0.05  # chosen: of photos of the bundle, those that show nothing of their place
-CHANCE_NEAR = 0.02  # chosen: probability that a photo has a pose near that by a wrong pose of the bundle
+MOST_UNSEEN = 1.0 / 3.0  # chosen: share of photos that may be no evidence for their place
+SILENT = 0.05  # chosen: share of photos of a bundle that show nothing of their place
+CHANCE_NEAR = 0.02  # chosen: probability that a photo has a pose near the one by a wrong pose of the bundle
 NUM_BUNDLES = 4  # poses of the bundle that are tested
-SCALES = 0.5, 2.0  # of positions in metres that are proposed, so that a wrong scale is seen
-LEAST_DISTANCE = 0.5  # [m] photos nearer to each other say nothing of the scale
+SCALES = 0.5, 2.0  # of positions in metres: proposed too, so that a wrong scale is noticed
+LEAST_DISTANCE = 0.5  # [m] photos nearer to each other do not determine the scale
 NUM_LIKELY = 2  # poses of a photo that propose a scale, those with the most probability
 
 
@@ -49,17 +49,17 @@ class Support(NamedTuple):
     """Evidence of a photo for a pose of the bundle."""
 
     own: Candidate  # its own pose there
-    gaussian: PoseGaussian | None  # that pose with its covariance; None where the points do not fix it
-    is_found: bool  # by the photo alone
-    odds: float  # of that pose's place, against that none of the photo's poses is right
+    gaussian: PoseGaussian | None  # its own pose with its covariance; None where the points do not fix it
+    is_found: bool  # the search of the photo alone has found its own pose
+    odds: float  # of its own pose's place, against that none of the photo's poses is right
     odds_elsewhere: float  # of the places of the photo's other poses
-    num_places: int  # of the scan where a photo alone may be
-    odds_exchanged: float = 0.0  # of the places of other photos of the bundle, in the mean
-    belongs: float = 1.0 - CONTRADICTED_ODDS  # probability beforehand that it is where others expect it
-    weight: float = 1.0  # of this evidence, less if other photos show the same
+    num_places: int  # number of places of the scan where a photo alone may be
+    odds_exchanged: float = 0.0  # mean odds of the places of other photos of the bundle
+    belongs: float = 1.0 - CONTRADICTED_ODDS  # prior probability that the photo is where others expect it
+    weight: float = 1.0  # of this evidence: less if other photos show the same
 
     def miss(self) -> "Support":
-        """Return the photo's evidence for a place that it does not show."""
+        """Return the evidence of a photo that does not show the place at all."""
         elsewhere = self.odds_elsewhere + self.odds
         return self._replace(is_found=False, odds=0.0, odds_elsewhere=elsewhere)
 
@@ -67,8 +67,8 @@ class Support(NamedTuple):
     def weights(self) -> Array:
         """Odds (4,): own pose right; own pose missed; photo outside of the scan; photo at another pose.
 
-        The odds of a photo alone allow for `num_places` places, of which it has the best. If the others leave
-        one place, or the few of exchanged photos, the odds are multiplied by `num_places`.
+        The odds of a photo alone allow for its pose being the best of `num_places` places. If the others
+        leave one place, or the few places of exchanged photos, the odds are multiplied by `num_places`.
         """
         belongs = self.belongs
         here = self.odds * self.num_places
@@ -110,7 +110,7 @@ def propose_bundles(members: Sequence[PosedMember], errors: RelativeErrors) -> l
 def propose_with_scale(
     one: PosedMember, own: Pose, other: PosedMember, own_of_other: Pose, errors: RelativeErrors
 ) -> list[Bundle]:
-    """Return the bundle whose scale is that of two photos' own poses; nothing if these do not fit."""
+    """Return the bundle with the scale by two photos' own poses; an empty list if the poses do not fit."""
     relative = other.cam_from_bundle @ one.cam_from_bundle.inverse()
     found = own_of_other @ own.inverse()
     given_apart = float(np.linalg.norm(relative.center_world))
@@ -128,7 +128,7 @@ def propose_with_scale(
 
 
 def join_near(members: Sequence[PosedMember], bundle: Bundle, errors: RelativeErrors) -> Bundle:
-    """Adjust a bundle to the photos' poses near it, all of one deviation."""
+    """Adjust a bundle to the photos' own poses near it, which all get the same deviation."""
     nothing = np.zeros((6, 6))
     near = []
     for member in members:
@@ -161,9 +161,9 @@ def find_supports(
 ) -> list[Support]:
     """Return a photo's evidence for each of several poses that may be expected of it.
 
-    It is that of its best own pose near the one expected. All of these, and its other poses, are weighed at
-    once, against each other and against that none is right. `exchanged` are poses that are expected of other
-    photos, one of which may be its own.
+    The evidence is that of its best own pose near the expected one. These own poses and its other poses are
+    weighed together, against each other and against that none is right. `exchanged` are poses expected of
+    other photos, one of which may be that of this photo.
     """
     own = [one for one, _ in member.own_poses]
     ranked = list(own)
@@ -190,9 +190,9 @@ def find_supports(
 
 
 def place_in(ranked: list[Candidate], problem: Problem, expected: Pose, workers: Workers) -> int:
-    """Return which of a photo's poses is near the one expected; if none is, append the best near it.
+    """Return the index of the photo's pose near the expected one; if none is near it, append the best there.
 
-    One that is not quite there may be a local optimum: the best near the one expected takes its place.
+    A pose that is not quite at the expected one may be a local optimum: the best near that replaces it.
     """
     near = next((k for k, own in enumerate(ranked) if ONE_IN_BUNDLE.holds(own.pose, expected)), None)
     if near is not None and RIGHT.holds(ranked[near].pose, expected):
@@ -207,7 +207,7 @@ def place_in(ranked: list[Candidate], problem: Problem, expected: Pose, workers:
 
 
 def estimate_errors_at(member: Member, problem: Problem, found: Candidate, workers: Workers) -> Errors:
-    """Return the errors of a photo's own pose: those known of its best, or those estimated at another."""
+    """Return the errors of a photo's own pose: the known ones if it is the best, else estimated ones."""
     if found.pose is member.found.selection.best.pose or found.score <= HOPELESS_SCORE:
         return Errors(member.alone.gaussian, member.alone.std_of_fit)
     is_counted = not problem.profile.is_narrow or found.num_matches is not None
@@ -218,7 +218,7 @@ def estimate_errors_at(member: Member, problem: Problem, found: Candidate, worke
 
 
 def list_near(problem: Problem, expected: Pose, workers: Workers) -> list[Candidate]:
-    """Return a photo's poses near the one expected: by whole views, by matches, and that itself."""
+    """Return a photo's poses near the expected one: by whole views, by matches, and that one itself."""
     poses = [refine(problem, expected, workers, FINE).pose]
     if problem.profile.refines_on_matches:
         drawn = draw_near(problem, expected, None, workers).matches
@@ -230,10 +230,11 @@ def list_near(problem: Problem, expected: Pose, workers: Workers) -> list[Candid
 def weigh_bundles(tested: Sequence[Sequence[Support]], members: Sequence[Member]) -> Array:
     """Return the probability (K + 1,) of each of K poses of the bundle, and of none.
 
-    The photos are independent evidence as far as they show different things, but a missed pose is charged
-    once, as bare walls and changed places lie together, and the third of the photos with the least odds is
-    not charged. Agreement of photos counts as far as it exceeds chance among all proposed poses. Wrong
-    relative poses, with each photo at any of its own poses, count as none.
+    The photos are independent evidence as far as they show different things. But missed poses are charged
+    only once for all photos, as bare walls and changed places lie together, and the third of the photos with
+    the least odds is not charged at all. The agreement of photos counts as far as it exceeds chance among all
+    proposed poses. That the relative poses are wrong, and each photo is at any of its own poses, counts as
+    none.
     """
     num_proposed = max(sum(len(member.own_poses) for member in members), 1)
     logits = []

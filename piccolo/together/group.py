@@ -1,8 +1,9 @@
 """Photos of one place whose relative poses are not known, localized together.
 
-Each photo is searched by itself. From each of its likely poses those of the others follow by their matches
-(`links`): that is a place of the group. The best places are tested in every photo, and weighed as poses of a
-bundle are. Photos that do not belong to the best place may belong to another; else each keeps its own result.
+Each photo is searched by itself. From each likely pose of a photo, the poses of the others follow by their
+matches (`links`); these poses together are called a place of the group. The best places are tested in every
+photo, and weighed as poses of a bundle are. Photos that do not belong to the best place may belong to
+another; else each keeps its own result.
 """
 
 import math
@@ -43,13 +44,13 @@ from .mirrored import refuse_mirrored
 from .nearby import localize_nearby
 
 NUM_ANCHORS = 5  # poses of a photo from which a place of the group may follow, the likeliest
-LEAST_LIKELY = 1e-3  # chosen: probability of such a pose
-MOST_SPREAD = 12  # places of the group that are looked at
+LEAST_LIKELY = 1e-3  # chosen: probability of a pose from which a place of the group may follow
+MOST_SPREAD = 12  # places of the group that are tried
 BELONGS_WEAKLY = 0.7  # chosen: probability that a photo belongs where few matches put it
 MOST_SOURCES = 3  # photos by whose errors a photo is placed
-MOST_STD_OF_SOURCE = 0.1  # chosen: [m] deviation of the own pose of one by which others are placed
-LEAST_LOCATED = 2  # photos that tell where the others were taken
-NUM_LOCATED = 2  # rounds in which local optima are told from right poses
+MOST_STD_OF_SOURCE = 0.1  # chosen: [m] deviation of the own pose of a photo by which others are placed
+LEAST_LOCATED = 2  # photos from which it follows where the others were taken
+NUM_LOCATED = 2  # rounds that distinguish local optima from right poses
 UNCERTAIN = np.zeros((6, 6))
 
 
@@ -79,7 +80,7 @@ class Expected(NamedTuple):
         return MISSED * min(FIRM.least / self.num_matches, 1.0)
 
     def temper(self, own: PoseGaussian | None, local_share: float) -> PoseGaussian:
-        """Return it with the errors of local optima, as far as it may be one.
+        """Return the expected pose with the errors of local optima, as far as it may be one.
 
         It is one if the photo's own pose contradicts it and is surer: `local_share` is the probability that
         the own pose is a local optimum.
@@ -91,10 +92,10 @@ class Expected(NamedTuple):
 
 
 class Grouped(NamedTuple):
-    """The result of a photo, and the photos with which it was localized together; none if it was alone."""
+    """The result of a photo, and the photos with which it was localized together."""
 
     result: Result
-    others: tuple[int, ...]  # numbers
+    others: tuple[int, ...]  # numbers of these photos; empty if it was localized alone
 
 
 @one_blas_thread()
@@ -103,10 +104,10 @@ def localize_group(
 ) -> list[Grouped]:
     """Localize photos that may belong together, in any order; those that do not are localized alone.
 
-    Those of all settings but their priors and traces are alike.
+    Their settings are alike, but for priors and traces.
     """
     contents = [sha256(shot.panorama.rgb.tobytes()).digest() for shot in shots]
-    order = sorted(range(len(shots)), key=contents.__getitem__)  # results depend on no other
+    order = sorted(range(len(shots)), key=contents.__getitem__)  # results do not depend on the order given
     alone, members, asked = find_members(scan_map, [shots[k] for k in order], workers, watch)
     grouped = {k: Grouped(one, ()) for k, one in enumerate(alone)}
     matched = {k: one for k, one in members.items() if one.found.problem.profile.uses_matches}
@@ -125,7 +126,7 @@ def localize_group(
 def localize_rest(
     scan_map: ScanMap, shots: Sequence[Shot], grouped: Mapping[int, Grouped], means: Means
 ) -> dict[int, Grouped]:
-    """Return the results of those photos that are not sure, but are found where the others were taken."""
+    """Return the results of photos that were not sure, but were found near where the others were taken."""
     sure = {k: one.result for k, one in grouped.items() if one.result.status == LOCALIZED}
     if len(sure) < LEAST_LOCATED:
         return {}
@@ -212,7 +213,7 @@ def count_votes(group: Group, places: Places) -> float:
 
 
 def settle_group(group: Group, places: Places, numbers: Collection[int]) -> Places:
-    """Place the photos again, by those whose own poses are likely and where they are expected to be."""
+    """Place the photos again, from the photos whose likely own poses are where they are expected."""
     own = {k: find_own(group.members[k], placed.pose) for k, placed in places.items()}
     anchors = {
         k: group.links.place(k, pose) for k, (pose, probability) in own.items() if probability > EVEN_ODDS
@@ -225,7 +226,8 @@ def weigh_places(
 ) -> tuple[list[Tested], Array]:
     """Test the best place, and those that put some of its photos elsewhere; return them, the likeliest first.
 
-    Return also the probability (K + 1,) of each of them, and of none, by all photos that have any of them.
+    Return also the probabilities (K + 1,) of these places, and of none, by all photos that have a pose in any
+    of the places.
     """
     rivals = [places for places in proposed[1:] if places.keys() & proposed[0].keys()]
     tested = examine_places(group, [proposed[0], *rivals], numbers, means)
@@ -240,7 +242,7 @@ def weigh_places(
 def examine_places(
     group: Group, proposed: Sequence[Places], numbers: Collection[int], means: Means
 ) -> list[Tested]:
-    """Test places in each of their photos, and in those that few matches put there."""
+    """Test places in each of their photos, and in photos that only a few matches put there."""
     tested = [Tested(spread(group.links, places, numbers, WEAK), {}) for places in proposed]
     for number in sorted({number for one in tested for number in one.places}):
         member = group.members[number]
@@ -254,7 +256,7 @@ def examine_places(
 
 
 def weigh_supports(links: Links, tested: Sequence[Tested]) -> list[Tested]:
-    """Weigh the evidence of photos for places: what several show counts once, by the one that tells most.
+    """Weigh the evidence of photos for places: what several show counts once, by the photo that shows most.
 
     A photo has the same weight for each place, so that places are compared by the same evidence.
     """
@@ -296,7 +298,7 @@ def judge_group(
 ) -> dict[int, Result]:
     """Return the results of the photos that belong to the first of several places of their group.
 
-    There are none if it is one photo, and no other is sure that it was taken there.
+    There are no results if only one photo belongs to it, and no other photo is sure to have been taken there.
     """
     best, *elsewhere = tested
     own, expected = locate_all(group.links, best)
@@ -313,7 +315,7 @@ def judge_group(
         is_own = member.is_best(support.own.pose) and placed.shares.right >= placed.shares.missed
         if is_refused or placed.gaussian is None or belongs.here < EVEN_ODDS:
             continue
-        if is_sure and not is_own:  # what is sure alone others do not move
+        if is_sure and not is_own:  # others do not move a pose that is sure alone
             continue
         others = [k for k, one in enumerate(elsewhere) if number in one.places]
         poses = [elsewhere[k].places[number].pose for k in others]
@@ -334,8 +336,8 @@ def list_sure(group: Group, tested: Tested) -> set[int]:
 def locate_all(links: Links, tested: Tested) -> tuple[dict[int, PoseGaussian], dict[int, PoseGaussian]]:
     """Return the photos' own poses that agree with a place, and where the others expect each photo.
 
-    Own poses have the errors of local optima too, as far as they may be such. Poses and probabilities are
-    found in turn, as in a bundle.
+    Own poses get the errors of local optima too, in proportion to the probability that they are such. Poses
+    and probabilities are computed in turn, as in a bundle.
     """
     found = {
         number: support.gaussian
@@ -355,9 +357,9 @@ def locate_all(links: Links, tested: Tested) -> tuple[dict[int, PoseGaussian], d
 
 
 def expect_all(links: Links, places: Places, own: Mapping[int, PoseGaussian]) -> dict[int, Expected]:
-    """Return where the others expect each photo, by their own poses or by where they are expected.
+    """Return where the others expect each photo.
 
-    A photo whose own pose is uncertain, as of a bare wall, is where it is expected.
+    The pose of each of the others is its own, or, if that is uncertain as of a bare wall, the one expected.
     """
     known = {number: one for number, one in own.items() if one.largest_std < MOST_STD_OF_SOURCE}
     located = {number: links.place(number, one.pose) for number, one in known.items()}
@@ -378,7 +380,7 @@ def expect_by_matches(
 ) -> Expected | None:
     """Return the pose of a photo by its matches with others; None if too few agree.
 
-    Its errors are those of the matches, and of the poses of the photos that tell the most; if few matches
+    Its errors are those of the matches and of the poses of the photos that determine it most; if few matches
     agree, also those of local optima.
     """
     parts = links.match(number, located)

@@ -1,9 +1,9 @@
-"""Links between photos: matches of their keypoints, and the poses that follow from each other's by them.
+"""Links between photos: matches of their keypoints, by which the pose of one follows from that of another.
 
-Two photos alone tell little of how a camera turned and moved between them: a short way hardly differs from a
-turn, and a wall has two solutions. The scan has the depth that they lack. If a photo was taken at a supposed
-pose, its keypoints get their ranges there, and their matches with those of another photo give that one's pose
-by P3P, and so on from photo to photo.
+Two photos alone show little of how a camera turned and moved between them: a short way hardly differs from a
+turn, and a wall has two solutions. The scan has the depth that the photos lack. If a photo is supposed to be
+at a pose, its keypoints get their ranges from the scan there. Their matches with the keypoints of another
+photo then give the other photo's pose by P3P, and so on from photo to photo.
 """
 
 import itertools
@@ -27,19 +27,19 @@ from ..system.jobs.threads import Workers
 from .relation import Relation, relate
 
 LEAST_LINKED = 6  # matches of two photos that may show the same
-LEAST_BRIDGE = 5  # matches that agree with two poses that were found apart
+LEAST_BRIDGE = 5  # matches that agree with the poses of two photos that were placed separately
 NUM_PROPOSED = 4  # poses by matches, of which the first that is allowed counts
-MOST_EACH = 40  # chosen: of more photos, each is matched with those only that look most like it
-NUM_LIKE = 20  # chosen: such photos
-NUM_LARGEST = 64  # chosen: keypoints of a photo by which these are found
+MOST_EACH = 40  # chosen: photos; if there are more, each is matched only with those that look most like it
+NUM_LIKE = 20  # chosen: photos that look most like one
+NUM_LARGEST = 64  # chosen: keypoints of a photo by which the photos like it are found
 Pair = tuple[NDArray[np.intp], NDArray[np.intp]]  # keypoints (M,) of a photo, and of another
 
 
 class Trust(NamedTuple):
-    """The least that the matches by which a photo is placed must tell."""
+    """Limits within which the matches of a photo place it."""
 
-    least: int  # that agree with a pose
-    reach: float  # [m] from the nearest photo that it is matched with
+    least: int  # number of matches that agree with a pose, at least
+    reach: float  # [m] from the nearest photo with which it is matched, at most
 
 
 FIRM = Trust(12, math.inf)  # of repeated patterns, as ceilings have, 8 matches agree by chance
@@ -50,7 +50,7 @@ class Placed(NamedTuple):
     """A photo at a supposed pose in the map."""
 
     pose: Pose
-    ranges: Array32  # (N,) [m] of its keypoints there, by the scan; 0 of those that it does not explain
+    ranges: Array32  # (N,) [m] of its keypoints, by the scan; 0 for those that the scan does not explain
 
 
 Places = Mapping[int, Placed]  # of photos, by their numbers
@@ -70,7 +70,7 @@ class Links:
         return [other for own, other in self.pairs if own == number]
 
     def list_groups(self) -> list[list[int]]:
-        """List the groups of photos that are linked, directly or by others; each in order."""
+        """List the groups of photos that are linked, directly or by way of others; each in order."""
         left = sorted(self.problems)
         groups = []
         while left:
@@ -82,7 +82,7 @@ class Links:
         return groups
 
     def place(self, number: int, pose: Pose) -> Placed:
-        """Suppose that a photo was taken at a pose."""
+        """Return a photo as it is if it was taken at a pose."""
         return Placed(pose, find_ranges(self.problems[number], pose, self.workers))
 
     def match(self, number: int, places: Places) -> dict[int, Matches]:
@@ -98,7 +98,7 @@ class Links:
 
 
 def find_links(problems: Mapping[int, Problem], workers: Workers) -> Links:
-    """Match the photos with each other; many, each with those that look most like it."""
+    """Match the photos with each other; if they are many, each with those that look most like it."""
     keypoints = {number: problem.photo.seen(workers).keypoints for number, problem in problems.items()}
     return Links(problems, keypoints, match_each(keypoints, workers), workers)
 
@@ -116,7 +116,7 @@ def match_each(keypoints: Mapping[int, Keypoints], workers: Workers) -> dict[tup
 
 
 def list_pairs(keypoints: Mapping[int, Keypoints], workers: Workers) -> list[tuple[int, int]]:
-    """List the pairs of photos to be matched: all, or of many those whose largest keypoints match best."""
+    """List the pairs of photos to be matched: all, or if many those whose largest keypoints match best."""
     every = list(itertools.combinations(sorted(keypoints), 2))
     if len(keypoints) <= MOST_EACH:
         return every
@@ -135,7 +135,7 @@ def list_pairs(keypoints: Mapping[int, Keypoints], workers: Workers) -> list[tup
 
 
 def match_two(one: Keypoints, other: Keypoints) -> Pair:
-    """Return the keypoints of two photos that match; none if the one mirrored has more matches."""
+    """Return the keypoints of two photos that match; none if one of them has more matches when mirrored."""
     mine, theirs = match_pictures(one, other)
     if len(mine) >= LEAST_LINKED and len(match_pictures(one.mirror(), other)[0]) > len(mine):
         return mine[:0], theirs[:0]
@@ -192,7 +192,7 @@ def are_bridged(links: Links, one: Places, other: Places) -> bool:
 
 
 def compute_shared(links: Links, places: Places, number: int) -> float:
-    """Return how often what a photo shows is shown by others: 1 if one other shows all of it."""
+    """Return by how many other photos a photo's content is shown, in the mean: 1 if one other shows all."""
     pose, ranges = places[number]
     is_seen = ranges > 0.0
     if not is_seen.any():

@@ -31,12 +31,12 @@ from ..system.jobs.threads import Stopwatch, Workers
 class Member:
     """A photo that was found by itself."""
 
-    found: Found  # without what takes memory
+    found: Found  # without images and matches, which take memory
     alone: Result
 
     @property
     def is_misplaced(self) -> bool:
-        """True if its focal length contradicts that of the other photos, as at a wrong place."""
+        """True if its focal length contradicts that of the other photos, as if its place is wrong."""
         prior = self.found.problem.given.focal_prior
         fit = self.found.fit
         has_conflict = fit is not None and fit.conflict > MOST_CONFLICT
@@ -59,7 +59,7 @@ MEMORY_OF_PHOTO = 4e7  # [byte] that a photo keeps while others are localized; 2
 
 
 def check_photos(number: int) -> None:
-    """Refuse more photos together than memory is left for."""
+    """Refuse to localize more photos together than the free memory holds."""
     check_memory(number * MEMORY_OF_PHOTO, f"{number} photos together", "localize fewer together")
 
 
@@ -72,7 +72,7 @@ class Shot(NamedTuple):
 
     @property
     def camera(self) -> tuple[object, ...]:
-        """All that was given of its camera; photos with the same are of one."""
+        """All that was given of its camera; photos for which it is the same were taken by one camera."""
         prior = self.panorama.focal_prior
         if prior is None:
             return ()
@@ -85,9 +85,9 @@ def find_members(
 ) -> tuple[list[Result], dict[int, Member], list[Shot]]:
     """Find each of several photos by itself.
 
-    Those that are not sure are found again with the focal length that those that are sure tell of their
-    camera. Returns the result of each photo alone, those that were searched by their numbers, and all photos
-    as they were asked last.
+    Photos that are not sure are searched again with the focal length that sure photos of the same camera
+    have. Returns the result of each photo alone, the photos that could be searched by their numbers, and all
+    photos as they were searched last.
     """
     alone = [nothing_found() for _ in shots]
     members: dict[int, Member] = {}
@@ -130,19 +130,19 @@ def find_alone(scan_map: ScanMap, shot: Shot, workers: Workers, watch: Stopwatch
 
 
 def expect_focal(panoramas: Sequence[Panorama], alone: Sequence[Result]) -> dict[int, Panorama]:
-    """Return the photos that are not sure, by number, with the focal length that those that are sure tell.
+    """Return the photos that are not sure, by number, with the focal length by those that are.
 
-    The photos are of one camera: what was given and what these say are averaged.
+    The photos are of one camera; the given focal length and the estimates of the sure photos are averaged.
     """
     opinions = [one.focal_length.opinion for one in alone if one.status == LOCALIZED and one.focal_length]
-    told = Consensus(opinions).opinion(least=1)
-    if told is None:
+    by_sure = Consensus(opinions).opinion(least=1)
+    if by_sure is None:
         return {}
     expected: dict[int, Panorama] = {}
     for k, (panorama, one) in enumerate(zip(panoramas, alone, strict=True)):
         prior = panorama.focal_prior
         if one.status != LOCALIZED and prior is not None:
-            share = told.share_of_given(prior.deviation)
-            focal_px = prior.focal * math.exp((1.0 - share) * told.off)
+            share = by_sure.share_of_given(prior.deviation)
+            focal_px = prior.focal * math.exp((1.0 - share) * by_sure.off)
             expected[k] = panorama.expect_focal(focal_px, prior.deviation * math.sqrt(share))
     return expected

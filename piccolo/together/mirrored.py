@@ -1,8 +1,8 @@
 """Photos of one place that were all mirrored, left for right.
 
 A rack or a thin wall, seen from behind, looks like the mirror image of its front: a mirrored photo of a part
-of a room may fit there, and several confirm each other. Their mirror images are found where the photos were
-taken.
+of a room may fit there, and several such photos confirm each other. If they are mirrored back, they are found
+where they were taken.
 """
 
 from collections.abc import Mapping
@@ -18,18 +18,19 @@ from ..localization.means import Means
 from ..localization.run import make_attempts
 from .members import Member
 
-# Chosen: of mirrored photos, against the photos as they are. Of 15 photos of a hospital none had more than
-# 0.41, one of racks that were mirrored 2.3.
+# Chosen: log odds of a mirrored photo against the photo as it is. Of 15 photos of a hospital none had more than
+# 0.41; one of the mirrored photos of racks had 2.3.
 LEAST_LOG_ODDS = 1.0
 
 
 def refuse_mirrored(
     results: Mapping[int, Result], members: Mapping[int, Member], means: Means, min_confidence: float
 ) -> dict[int, Result]:
-    """Return the localized ones of photos that are linked, refused, if they were all mirrored; else nothing.
+    """Return refused results of the localized photos among linked ones, if all were mirrored; else none.
 
-    No mirrored photo is linked with one that is not. So their mirror images are searched if one of them alone
-    was ruled out as mirrored, or none of those localized was sure alone. The photo that tells most decides.
+    No mirrored photo is linked with one that is not. So the mirror images are searched if one of the photos
+    was ruled out as mirrored by itself, or if no localized photo was sure by itself. The photo with the
+    largest log odds, for or against, decides.
     """
     localized = [k for k, result in results.items() if result.status == LOCALIZED]
     one_is_mirrored = any(Reason.MIRRORED in members[k].alone.belief.ruled_out for k in results)
@@ -43,7 +44,7 @@ def refuse_mirrored(
 
 
 def rule_out_mirrored(result: Result, min_confidence: float) -> Result:
-    """Return the result of a photo that was mirrored."""
+    """Return the result of a photo, ruled out as mirrored, with the warning."""
     refused = result.take_belief(result.belief.rule_out(Reason.MIRRORED), min_confidence)
     return replace(refused, warnings=(*refused.warnings, MIRRORED))
 

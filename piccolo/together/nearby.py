@@ -1,6 +1,6 @@
 """Photos of a group that are not sure, searched once more where the others were taken.
 
-What a bare wall shows is no place in a whole scan, but one of few within reach of a place that is known.
+A photo of a bare wall may be anywhere in a whole scan, but fits only few places within reach of a known one.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from ..scan_map.scan_map import ScanMap
 from ..system.arrays import Array
 from .members import Shot
 
-REACH = 1.0  # chosen: [m] of a photo that is taken with others, from the nearest of these
+REACH = 1.0  # chosen: [m] from the nearest photo of those that were taken together
 
 
 def localize_nearby(
@@ -28,7 +28,8 @@ def localize_nearby(
 ) -> Result | None:
     """Return the result of a photo within reach of others, whose poses in the map are known.
 
-    None if there is no place, or it is not sure there either, as where its points do not fix it.
+    None if there is no candidate place, or if the photo is not sure there either, as where the points do not
+    fix its pose.
     """
     whole = prepare_search(scan_map, shot.panorama, shot.settings, means.watch)
     if whole is None:
@@ -48,7 +49,7 @@ def localize_nearby(
 
 
 def compute_odds_elsewhere(scan_map: ScanMap, alone: Result, located: Sequence[Pose]) -> float:
-    """Return the odds of a photo's places beyond reach of others, against that it has none."""
+    """Return the odds of a photo's places beyond reach of the others, against that none is right."""
     if alone.best_pose is None:
         return 0.0
     poses = [alone.best_pose, *(alternative.pose for alternative in alone.alternatives)]

@@ -1,8 +1,8 @@
-"""The pose of a photo by its matches with others whose points the scan has, and the errors of that pose.
+"""The pose of a photo by its matches with others whose keypoints have ranges, and the errors of that pose.
 
-Matches of a wall, or of few things far away, fit more than one pose nearly as well. So the loss is descended
-from both sides of the pose, along the two directions that the matches tell least of, and how far the other
-optima are counts among the errors as far as they are as likely.
+Matches of a wall, or of few things far away, fit several poses nearly equally well. So further descents begin
+on both sides of the pose, along the two directions that the matches determine least. The distances of the
+optima that they find are added to the errors, weighted by how likely the optima are.
 """
 
 from typing import NamedTuple
@@ -17,11 +17,11 @@ from ..local_features.hypotheses import COS_EXACT, REFINE_SCALE, find_inliers, r
 from ..local_features.matching import Matches
 from ..system.arrays import Array
 
-NUM_WEAK = 2  # directions in which a pose is tried
-TRIED = (0.15, 0.3)  # [m] on both sides of it
-RANGE_OF_TURN = 3.0  # chosen: [m] by which a turn [rad] is compared with a move
+NUM_WEAK = 2  # directions in which further descents begin
+TRIED = (0.15, 0.3)  # [m] distances of their starts, on both sides of the pose
+RANGE_OF_TURN = 3.0  # chosen: [m] times a turn [rad] is the move to which the turn is compared
 STEPS_OF_RELATION = 30  # of a descent
-LEAST_MOVE = 0.05  # of a direction of unit length: others turn only
+LEAST_MOVE = 0.05  # part of a unit direction that moves the camera: with less, it is hardly more than a turn
 
 
 class Relation(NamedTuple):
@@ -47,7 +47,7 @@ def relate(matches: Matches, near: Pose) -> Relation:
 
 
 def list_weak_steps(matches: Matches, pose: Pose) -> list[Array]:
-    """Return steps (6,) in the directions that the matches that agree with a pose tell least of."""
+    """Return steps (6,) in the directions that are least determined by the matches that agree with a pose."""
     agreeing = find_inliers(matches, pose, COS_EXACT)
     _, J = differentiate_rays(matches.points[agreeing], pose)
     units = np.array([1.0, 1.0, 1.0, *[1.0 / RANGE_OF_TURN] * 3])

@@ -1,8 +1,9 @@
-"""Which photos of a batch get a second look, and what the photos of one camera say together.
+"""Second looks: which photos of a batch are localized again, and the focal length of a camera by its photos.
 
-Photos that are unsure, or off in focal length, are looked at again with the focal length of the others, then
-beside those that are sure, then together with those that were taken with them. A look beside sure photos, any
-of the batch, costs their matches only; together, photos need none that is sure, but are searched once more.
+Photos that are unsure, or whose focal length is off, are localized again with the focal length of the others,
+then beside photos that are sure, then together with the photos that were taken with them. A look beside sure
+photos of the batch takes only matches with these. A look together needs no sure photo, but each photo is
+searched once more.
 """
 
 import json
@@ -21,22 +22,22 @@ from ..judge.result_parts import WIDE, Beside, FocalLength
 from ..judge.sure import SURE_CONFIDENCE
 from .series import list_series
 
-MOST_PICTURES = 200  # beside which a photo is looked at again
-BETTER = 0.7  # others' deviation must be below this fraction of the photo's own
+MOST_PICTURES = 200  # sure photos beside which a photo is localized again
+BETTER = 0.7  # the others' deviation of the focal length must be below this fraction of the photo's own
 ONE_CAMERA = 1.02  # largest ratio of neighbouring given focal lengths of one camera: focusing changes them
-TOLD_CHANGE = 1e-3  # of a confidence: a smaller one is not written again
+LEAST_WRITTEN_CHANGE = 1e-3  # of a confidence: after a smaller one, a result is not written again
 Item = TypeVar("Item")
 
 
 class Look(NamedTuple):
-    """A photo to look at again."""
+    """A photo to be localized again."""
 
     number: int  # in the batch
     pano: str
-    first: Result | None  # without the others; None if that is to be computed again
-    beside: tuple[Result, ...]  # of the photos that are sure
-    asked_sha256: str  # digest of these
-    focal: FocalLength | None = None  # as found so far, with what other photos of the camera say
+    first: Result | None  # the result without the others; None if it is to be computed again
+    beside: tuple[Result, ...]  # results of sure photos, beside which it is to be localized
+    asked_sha256: str  # digest of the photos `beside`, or of the series
+    focal: FocalLength | None = None  # as found so far, with that of the other photos of the camera
     series: tuple[Result, ...] = ()  # it and the photos taken with it, if they are to be localized together
 
 
@@ -46,7 +47,7 @@ class Change(NamedTuple):
     number: int  # in the batch
     before: Result
     after: Result
-    is_news: bool  # False if only how the photo was looked at has changed, or its confidence
+    is_news: bool  # False if only the confidence has changed, or how the photo was localized
 
 
 def is_doubtful(result: Result) -> bool:
@@ -66,13 +67,13 @@ def localize_in_order(
     look_again: Callable[[Item, Look], Result],
     min_confidence: float,
 ) -> Iterator[Result]:
-    """Yield the results of photos that help each other; those behind one that may change wait for it."""
+    """Yield the results of photos in order; a result that may still change holds back those behind it."""
     results: list[Result] = []
-    num_told = 0
+    num_yielded = 0
     for photo in photos:
         results.append(localize(photo))
-        if num_told == len(results) - 1 and not may_change(results[-1]):
-            num_told += 1
+        if num_yielded == len(results) - 1 and not may_change(results[-1]):
+            num_yielded += 1
             yield results[-1]
 
     def ask(looks: Sequence[Look]) -> Iterator[Result]:
@@ -80,16 +81,16 @@ def localize_in_order(
 
     for _ in revise(results, ask, min_confidence):
         pass
-    yield from results[num_told:]
+    yield from results[num_yielded:]
 
 
 def revise(
     results: list[Result], ask: Callable[[Sequence[Look]], Iterable[Result]], min_confidence: float
 ) -> Iterator[Change]:
-    """Change results in their list by what the photos tell each other, and yield each change.
+    """Localize photos again by the evidence of others, replace their results in the list; yield each change.
 
-    `ask` returns the results of looks in their order; one with an error changes nothing. If it returns fewer,
-    as the work was interrupted, this ends.
+    `ask` returns the results of looks in their order. A result with an error changes nothing. If `ask`
+    returns fewer results, as the work was interrupted, no more looks are made.
     """
     for list_looks in LISTINGS:
         yield from follow_cameras(results, min_confidence)
@@ -108,9 +109,9 @@ def revise(
 
 
 def follow_cameras(results: list[Result], min_confidence: float) -> Iterator[Change]:
-    """Change results in their list by what all photos of a camera say, and yield each change.
+    """Replace results in their list by the focal length of all photos of a camera, and yield each change.
 
-    Together they may confirm the focal length given, doubt it, or contradict it.
+    Together, the photos may confirm the given focal length, make it doubtful, or contradict it.
     """
     for camera in group_by_camera(results):
         consensus = Consensus([known.opinion for _, known in camera]).opinion()
@@ -121,13 +122,13 @@ def follow_cameras(results: list[Result], min_confidence: float) -> Iterator[Cha
             after = follow_consensus(before, consensus, min_confidence)
             after = replace(after, warnings=tuple(dict.fromkeys(after.warnings)))
             is_other = after.status != before.status or after.warnings != before.warnings
-            if is_other or abs(after.confidence - before.confidence) > TOLD_CHANGE:
+            if is_other or abs(after.confidence - before.confidence) > LEAST_WRITTEN_CHANGE:
                 results[k] = after
                 yield Change(k, before, after, after.status != before.status)
 
 
 def list_looks_by_focal(results: Sequence[Result]) -> list[Look]:
-    """List the photos whose focal length others know better, if they are not localized or theirs is off."""
+    """List the photos whose focal length others know better, if they are not localized or it is off."""
     looks = []
     for camera in group_by_camera(results):
         consensus = Consensus([known.opinion for _, known in camera])
@@ -137,17 +138,18 @@ def list_looks_by_focal(results: Sequence[Result]) -> list[Look]:
                 continue
             px = focal.given_px * math.exp(others.off)
             std_px = math.sqrt(others.variance) * px
-            told = replace(focal, others_px=px, others_std_px=std_px)
+            with_others = replace(focal, others_px=px, others_std_px=std_px)
             is_off = abs(px - focal.px) > focal.std_px
             if std_px < BETTER * focal.std_px and (is_off or results[k].status != LOCALIZED):
-                looks.append(Look(k, results[k].pano, None, (), digest_of([]), told))
+                looks.append(Look(k, results[k].pano, None, (), digest_of([]), with_others))
     return looks
 
 
 def group_by_camera(results: Sequence[Result]) -> list[list[tuple[int, FocalLength]]]:
-    """Return numbers and focal lengths of photos by camera: of one size, source and about what was given.
+    """Return numbers and focal lengths of photos by camera.
 
-    Those whose focal length was a mere guess are left out.
+    Photos are of one camera if size, source and, nearly, the given focal length are the same. Photos whose
+    focal length was a mere guess are left out.
     """
     known = [
         (result.source.image_size or (0, 0), focal.source, focal.given_px, k, focal)
@@ -169,8 +171,8 @@ def group_by_camera(results: Sequence[Result]) -> list[list[tuple[int, FocalLeng
 def list_looks_beside(results: Sequence[Result]) -> list[Look]:
     """List the photos that are not sure, each with others that are.
 
-    These are the nearest in order: what was taken one after another mostly belongs together. A photo that was
-    looked at beside the same photos, and has the same in its series, is done.
+    The others are those nearest in order, as photos that were taken one after another mostly belong together.
+    A photo that has been localized beside the same photos before, with the same series, is left out.
     """
     series = {k: numbers for numbers in list_series(results) for k in numbers}
     sure = [
@@ -205,9 +207,9 @@ def list_looks_together(results: Sequence[Result]) -> list[Look]:
 
 
 def follow(first: Result, found: Result) -> Result:
-    """Return what was found of a photo by others, with what it had alone.
+    """Return the result of a second look, with the photo's own estimate of its focal length from the first.
 
-    Only what a photo says alone of its focal length counts for others.
+    Only a photo's estimate from itself alone counts for the focal length of others.
     """
     focal = found.focal_length
     if first.focal_length is not None:
@@ -218,7 +220,7 @@ def follow(first: Result, found: Result) -> Result:
 
 
 def names_of(result: Result) -> tuple[str, ...]:
-    """Return the names of the photos by which a result was found, too."""
+    """Return the names of the other photos that have contributed to a result."""
     return result.beside.photos if result.beside else ()
 
 
@@ -226,6 +228,6 @@ LISTINGS = (list_looks_by_focal, list_looks_beside, list_looks_together)  # in t
 
 
 def digest_of(results: Sequence[Result]) -> str:
-    """Return a digest of photos: of their paths and contents."""
+    """Return a digest of the paths and contents of photos."""
     photos = [(result.pano, result.source.pano_sha256) for result in results]
     return sha256(json.dumps(photos).encode()).hexdigest()

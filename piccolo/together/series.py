@@ -9,17 +9,18 @@ from pathlib import PurePath
 
 from ..judge.result import Result
 
-MOST_PAUSE = 60.0  # [s] chosen: between photos of one place
+MOST_PAUSE = 60.0  # [s] chosen: between successive photos of one place
 MOST_IN_SERIES = 24  # chosen: two turns of twelve; longer series are divided
 
 
 def list_series(results: Sequence[Result]) -> list[list[int]]:
-    """List the numbers of photos with `cameras` that may have been taken together, two and more.
+    """List the series, of two photos and more, that may have been taken together, by the photos' numbers.
 
-    Photos with times were, if at most a minute is between one and the next. Of others the names tell, if they
-    are alike but for a number. Those whose names are like no other's are one series: pictures tell more.
+    Only photos with `cameras` are listed. Photos with times form a series if at most a minute is between one
+    and the next. Photos without times form a series if their names are alike but for a number; those whose
+    names are like no other's form one series, as their pictures decide later whether they belong together.
     """
-    timed: dict[bool, list[tuple[datetime, int]]] = {}  # those of clocks with an offset, and without
+    timed: dict[bool, list[tuple[datetime, int]]] = {}  # True: times without an offset from UTC
     named: dict[str, list[int]] = {}
     for k, result in enumerate(results):
         if result.cameras and result.source.capture_time:
