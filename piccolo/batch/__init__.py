@@ -1,1 +1,1 @@
-"""Many photos: what is given, what answers them, and the file of results."""
+"""Many photos: their inputs, the loop that localizes them, and the file of results."""

@@ -1,4 +1,4 @@
-"""The photos of a batch are answered, and looked at again with what the others tell, until a signal."""
+"""The loop of a batch: each photo is localized, and some again with the help of others, until a signal."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -13,32 +13,32 @@ from ..together.second_looks import LISTINGS, Change, Look, follow_cameras, revi
 from .localizer import Answer, Localizer, Task
 
 Executor = Here | Processes | Cluster
-Show = Callable[[Iterable[Any]], Iterable[Any]]  # wraps what is at work
+Show = Callable[[Iterable[Any]], Iterable[Any]]  # wraps an iterable to show its progress
 
 
 def follow_all(results: list[Result], min_confidence: float) -> Iterator[tuple[Change, Answer]]:
-    """Change results in their list by what all photos of a camera say; yield each change and its answer."""
+    """Replace results in their list by the focal length of their camera; yield changes and answers."""
     for change in follow_cameras(results, min_confidence):
         yield change, Answer(change.after, change.after.warnings)
 
 
 def count_looks(results: Sequence[Result]) -> int:
-    """Return how many photos are to be looked at again."""
+    """Return how many photos are to be localized again."""
     return sum(len(list_looks(results)) for list_looks in LISTINGS)
 
 
 @dataclass(frozen=True)
 class Answering:
-    """Photos are answered in this process, in several, or in a cluster."""
+    """The means to localize photos: in this process, in several, or in a cluster."""
 
     executor: Executor
     localizer: Localizer
-    cloud_sha256: str | None = None  # of the scan, where it is known
+    cloud_sha256: str | None = None  # digest of the scan, if it is known
 
     def answer_all(
         self, tasks: Iterator[Task], show: Show = iter, interruption: Interruption | None = None
     ) -> Iterator[Answer]:
-        """Yield the answers to tasks in order, after a signal those that are done."""
+        """Yield the answers to tasks in order; after a signal, only those that are done."""
         values = self.executor.values(tasks)
         pairs = show(values)
         for task, wait in interruption.each(pairs, values.take_finished()) if interruption else pairs:
@@ -55,10 +55,10 @@ class Answering:
         interruption: Interruption,
         tell: Callable[[str], object],
     ) -> Iterator[tuple[Change, Answer]]:
-        """Change results in their list by what others say of their camera, and then beside others.
+        """Replace results in their list by the focal length of their camera, then by looks beside others.
 
-        Yields each change, with the answer it is by; `show` gets also how many looks there are. `tell` is
-        told why a look has failed.
+        Yields each change, with the answer from which it comes. `show` gets the looks and their number.
+        `tell` is called with the reason if a look fails.
         """
         answered: dict[int, Answer] = {}
 

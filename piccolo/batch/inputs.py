@@ -1,4 +1,4 @@
-"""Inputs of a batch: photos by files, folders and names, and what is known of them beforehand."""
+"""Inputs of a batch: photos by files, folders and names, and prior knowledge of them."""
 
 import codecs
 import csv
@@ -20,7 +20,7 @@ from ..system.files.json_file import read_bytes, read_text
 
 STDIN = "-"
 WANTED_LIST = "wanted a text file, a photo's path on each line"
-MAX_KINDS = 5  # of files left out that are named
+MAX_KINDS = 5  # kinds of files left out that a message names
 GRAVITY = ("gravity_x", "gravity_y", "gravity_z")
 COLUMNS = ("x", "y", "z", "radius", "heading", "tolerance", "height", *GRAVITY, "within")
 NOT_WITHOUT = {"x": "y", "y": "x", "z": "x", "radius": "x", "tolerance": "heading"}
@@ -29,11 +29,11 @@ BETWEEN_NAMES = ";"
 WANTED = f"wanted a CSV file whose first line names its columns: name and any of {', '.join(COLUMNS)}"
 DEFAULT_RADIUS = 5.0  # [m]
 HEIGHT_TOLERANCE = 0.3  # [m] either side of a height
-Row = tuple[Prior, Vector | None]  # with the direction of gravity, in place of that of all photos
+Row = tuple[Prior, Vector | None]  # prior of a photo, and its own direction of gravity if it has one
 
 
 def is_from_stdin(words: Sequence[str]) -> bool:
-    """Return True if names come on standard input, so that nobody knows how many."""
+    """Return True if names come on standard input, so that their number is not known."""
     return STDIN in words
 
 
@@ -84,7 +84,7 @@ def _at(path: Path, left_out: Counter[str], is_panorama: Callable[[Path], bool])
 
 
 def _folders(top: Path, is_panorama: Callable[[Path], bool]) -> Iterator[tuple[Path, bool]]:
-    """Yield a folder and those in it, each once, links last; and whether each is one panorama."""
+    """Yield a folder and the folders in it, each once, links last; and whether each is one panorama."""
     waiting = deque([top])
     seen = set[tuple[int, int]]()
     while waiting:
@@ -100,7 +100,7 @@ def _folders(top: Path, is_panorama: Callable[[Path], bool]) -> Iterator[tuple[P
 
 
 def describe_left_out(left_out: Counter[str]) -> str:
-    """Say how many files are left out, by kind; nothing if none are."""
+    """Describe how many files are left out, by kind; the text is empty if there are none."""
     kinds = sorted(left_out.items(), key=lambda kind: (-kind[1], kind[0]))[:MAX_KINDS]
     if rest := left_out.total() - sum(count for _, count in kinds):
         kinds.append(("of other kinds", rest))
@@ -110,7 +110,7 @@ def describe_left_out(left_out: Counter[str]) -> str:
 
 @dataclass(frozen=True)
 class PriorTable:
-    """Prior knowledge of single photos, by name; it goes before that of all."""
+    """Prior knowledge of single photos, by name; it replaces that of all photos."""
 
     path: Path
     by_name: Mapping[str, Row]
@@ -133,7 +133,7 @@ class PriorTable:
 
 
 def _row_from(row: Mapping[str, float], within: tuple[str, ...], general: Prior) -> Row:
-    """Return a row of numbers and names; `general` fills what they leave open."""
+    """Return a row from numbers and names; `general` fills the fields that are not given."""
     changes: dict[str, Any] = {"within": within or general.within}
     if "x" in row:
         changes["near"] = (row["x"], row["y"], row.get("z"))
@@ -151,7 +151,7 @@ def _row_from(row: Mapping[str, float], within: tuple[str, ...], general: Prior)
 
 
 def read_priors(path: Path, general: Prior) -> PriorTable:
-    """Return the priors in a CSV file; cells may be empty, `general` fills what they leave open.
+    """Return the priors in a CSV file; cells may be empty, `general` then fills the field.
 
     Columns: name (the panorama's path as given, or its file name), x, y, z [m] in the scan's frame (without z
     in any height), radius [m] about them, heading [deg] of the image centre clockwise from +y, its tolerance
@@ -193,7 +193,7 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
 
 
 def _read_positions(path: Path, general: Prior) -> PriorTable | None:
-    """Return priors by the positions in a table of given poses; None if it is none, or a table of priors."""
+    """Return priors by the positions in a table of given poses; None if the file is not such a table."""
     from ..poses.pose_table import read_pose_table  # noqa: PLC0415  # it imports scipy, which takes long
 
     try:

@@ -31,7 +31,7 @@ from ..together.coloring import painting
 from .localizer import Localizer, rename
 from .results_file import WAYS, Records
 
-NUM_TRIED = 3  # frames that can't be read for one reason, and the last: then none can
+NUM_TRIED = 3  # first frames: a walk is refused if one reason prevents reading all of them and the last
 WriteSteps = Callable[[str, Sequence[Step]], object]  # of the search of a photo, by its name
 
 
@@ -40,22 +40,22 @@ class Job(NamedTuple):
 
     what: str  # the photos, in words
     photos: Mapping[str, Photo]  # by their names in the results
-    fields: Callable[[Path], Mapping[str, Any]]  # of a photo's line, that say how it was made
+    fields: Callable[[Path], Mapping[str, Any]]  # fields of a photo's line that say how it was made
     run: Callable[[Journal], list[Result] | Interruption]
-    output: Path | None = None  # that is written beside the results
+    output: Path | None = None  # further file that is written beside the results
 
 
 class Done(NamedTuple):
     """The results of a job."""
 
     results: list[Result]
-    seconds: float | None  # that it took; None if an earlier run had done all
+    seconds: float | None  # time that the job took; None if an earlier run had done all
 
 
 def run_job(job: Job, out: Path | None, is_new: bool) -> Done | Interruption:
-    """Do a job, or what an earlier run has left of it, and write the results, unless a signal ends it.
+    """Do the steps of a job that no earlier run has done, and write the results, unless a signal ends it.
 
-    Its steps are gone when no photo is to be tried again.
+    The file of steps is deleted, unless a photo is to be tried again.
     """
     path = steps_file(out)
     if path and out and not is_new and is_finished(out, job):
@@ -77,14 +77,14 @@ def run_job(job: Job, out: Path | None, is_new: bool) -> Done | Interruption:
 
 
 def steps_file(out: Path | None) -> Path | None:
-    """Return where the steps of a job are kept until its results are whole; None for a stream."""
+    """Return the file that keeps the steps of a job until all results are written; None for a stream."""
     return None if out is None or is_stream(out) else out.with_name(f"{out.name}.steps")
 
 
 def is_finished(out: Path, job: Job) -> bool:
-    """Return True if an earlier run of a job has left all results, none of a photo that failed or is another.
+    """Return True if an earlier run has left all results of a job, of unchanged photos that did not fail.
 
-    Raises InputError for results of something else.
+    Raises InputError if the file has results of another job.
     """
     records = Records(out)
     records.read(job.fields, job.photos)
@@ -112,7 +112,7 @@ def make_bundle_job(
         answer = localizer.answer_in(scan)
         results = []
         for path, pose, trace in zip(photos, poses, traces, strict=True):
-            if pose is None:  # structure from motion did not register it
+            if pose is None:  # structure from motion did not register the photo
                 alone = answer(localizer.task(path))
                 trace.steps.extend(alone.steps)
             results.append(alone.result if pose is None else next(found))
@@ -152,7 +152,7 @@ def make_group_job(
 def make_coloring_job(
     localizer: Localizer, scan: Scan, photos: Sequence[Path], out: Path, write_steps: WriteSteps
 ) -> Job:
-    """Return the job of localizing photos in the colours of the others, by which `out` is to be coloured."""
+    """Return the job of localizing photos in the colours of the others, and of colouring `out` by them."""
     scan_map, _ = scan.require_default_method("colours", scan.settings)
     painting.check_point_files(localizer.paths)
     given = {str(path): localizer.ask(path)[0] for path in photos}
@@ -174,21 +174,21 @@ class WalkInput(NamedTuple):
     """A frame of a walk."""
 
     photo: Photo
-    time: float  # [s] since the first; of frames without times their number
+    time: float  # [s] since the first frame; the frame's number if frames have no times
     name: str  # in the results
     odometry: Pose | None = None
 
     def step(self, digest: str | None) -> str:
-        """Return the name of the step that follows it, if its file has a digest."""
+        """Return the name in the journal of the step that tracks this frame, with the digest of its file."""
         return f"{self.name} {self.time} {digest}"
 
 
 class Watching(NamedTuple):
-    """Who is told while a walk is followed."""
+    """Functions that are called while a walk is followed, to show its progress."""
 
-    show_frames: Callable[[Iterable[Pair]], Iterable[Pair]]  # wraps those that are left
-    tell: Callable[[str], object]  # why a frame can't be read
-    show: Progress  # of the rest
+    show_frames: Callable[[Iterable[Pair]], Iterable[Pair]]  # wraps the frames that are left
+    tell: Callable[[str], object]  # called with the reason if a frame can't be read
+    show: Progress  # of the second look, after all frames
     write_steps: WriteSteps
 
 
@@ -207,13 +207,13 @@ def make_walk_job(frames: Sequence[WalkInput], walk: Walk, is_traced: bool, watc
 def follow_frames(
     walk: Walk, frames: Sequence[WalkInput], journal: Journal, watching: Watching
 ) -> Interruption:
-    """Follow the frames, and keep what was found of each; say why one can't be read."""
+    """Localize the frames in order, and keep each in the journal; tell why one can't be read."""
     steps = (frame.step(sha256_of(frame.photo.path, frame.photo.instant)) for frame in frames)
     journal.recall(steps, lambda k, text: walk.restore(text, frames[k].photo))
     left = iter(frames[len(walk.blanks) :])
     searched = walk.tracker.means.trace.steps
     with ThreadPoolExecutor(1) as pool, interruptible() as interruption:
-        # each is prepared while the one before it is followed
+        # each frame is prepared while the one before it is localized
         prepared = InFlight(lambda frame: pool.submit(walk.prepare, frame.photo, frame.name), left, 2)
         pairs = watching.show_frames(prepared)
         for frame, wait in interruption.each(pairs) if journal.is_kept else pairs:
@@ -231,7 +231,7 @@ def follow_frames(
 
 
 def check_others(walk: Walk, frames: Sequence[WalkInput], error: str) -> None:
-    """Refuse a walk whose first frames, and the last, can't be read for one reason."""
+    """Refuse a walk whose first frames, and the last, can't be read for the same reason."""
     others = [*frames[1:NUM_TRIED], frames[-1]]
     found = (str(walk.prepare(other.photo, other.name).blank.error) for other in others)
     is_same = (text.replace(o.name, frames[0].name) == error for text, o in zip(found, others, strict=True))

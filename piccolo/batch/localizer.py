@@ -1,4 +1,4 @@
-"""Answers to the photos of a batch, in this process or where else the scan is opened."""
+"""Answers to the photos of a batch, in this process or another one that has opened the scan."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -38,12 +38,12 @@ class Task(NamedTuple):
 
     photo: Photo
     settings: Settings
-    files: Mapping[str, bytes] | None = None  # what is at its path, where that is not to be seen
-    look: Look | None = None  # if it is looked at again
+    files: Mapping[str, bytes] | None = None  # content of its file or folder, where its path can't be read
+    look: Look | None = None  # a second look at the photo; None for the first
 
     @contextmanager
     def place(self, folder: Path) -> Iterator[Photo]:
-        """Yield the photo at its path here: relative to a folder, or written from the files."""
+        """Yield the photo with a path that can be read here: in `folder`, or written from `files`."""
         if self.files is None:
             yield replace(self.photo, picture=folder / self.photo.path)
             return
@@ -52,7 +52,7 @@ class Task(NamedTuple):
             yield replace(self.photo, picture=temporary / self.photo.path.name)
 
     def write_files(self, folder: Path) -> None:
-        """Write the files that the task has into a folder."""
+        """Write the task's `files` into a folder."""
         for name, content in (self.files or {}).items():
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -72,7 +72,7 @@ def rename(result: Result, names: Mapping[str, str]) -> Result:
 
 
 def files_of(pano: Path) -> dict[str, bytes]:
-    """Return the content of a photo's file, or of all files in its folder; none of what can't be read."""
+    """Return the content of a photo's file, or of all files in its folder, without unreadable ones."""
     with suppress(OSError):
         paths = sorted(pano.rglob("*")) if pano.is_dir() else [pano]
         return {str(path.relative_to(pano.parent)): path.read_bytes() for path in paths if path.is_file()}
@@ -80,10 +80,10 @@ def files_of(pano: Path) -> dict[str, bytes]:
 
 
 class Answer(NamedTuple):
-    """A result, and the pictures that go with it."""
+    """A result, and the pictures that belong to it."""
 
     result: Result
-    warnings: tuple[str, ...] = ()  # of the photo, without those of the scan
+    warnings: tuple[str, ...] = ()  # those of the photo, without those of the scan
     overlay: bytes | None = None  # PNG
     occlusion_mask: bytes | None = None  # PNG
     steps: tuple[Step, ...] = ()  # of the search
@@ -94,18 +94,18 @@ class Localizer:
     """A scan and the options for its photos, which answer tasks; pickled for other processes."""
 
     paths: tuple[Path, ...]  # of the scan
-    settings: Settings  # for which the scan is prepared
+    settings: Settings  # with which the scan is prepared
     cloud_settings: CloudSettings
-    photo: Photo  # the options of all photos; its picture is none
+    photo: Photo  # the options that all photos share; it has no picture
     cache: CachePolicy
     priors: PriorTable | None = None
     num_threads: int = 1
-    max_memory: float | None = None  # [10^9 byte], of a process
+    max_memory: float | None = None  # [10^9 byte] of each process
     makes_overlays: bool = False
     makes_occlusion_masks: bool = False
     is_traced: bool = False
-    folder: Path = Path()  # which paths are relative to
-    map_name: str | None = None  # of a map's file: absolute, or as a cluster's workers have been sent it
+    folder: Path = Path()  # to which paths are relative
+    map_name: str | None = None  # a map's file: its absolute path, or its name among a cluster's sent files
     sends_photos: bool = False
 
     @property
@@ -123,7 +123,7 @@ class Localizer:
         return photo, replace(settings, prior=prior)
 
     def task(self, pano: Path, calibration: Calibration | None = None) -> Task:
-        """Return what is to be done for a photo; its calibration counts if no option gives one."""
+        """Return the task of localizing a photo; `calibration` is used if no option gives one."""
         photo, settings = self.ask(pano)
         if calibration is not None and photo.camera is None and photo.rig is None:
             photo = photo.with_calibration(calibration)
@@ -132,7 +132,10 @@ class Localizer:
     def expect(
         self, cloud_sha256: str, more: Mapping[str, Any] | None = None
     ) -> Callable[[Path], Mapping[str, Any]]:
-        """Return a function of a photo's path: the fields that say how its line was made, with `more`."""
+        """Return a function that gives, for a photo's path, the fields that say how its line was made.
+
+        The fields `more` are added to all of them.
+        """
 
         @lru_cache
         def make_fields(settings: Settings, gravity_vector: Vector | None) -> Mapping[str, Any]:
@@ -148,7 +151,7 @@ class Localizer:
         return expect
 
     def open(self) -> Callable[[Task], Answer]:
-        """Open the scan in this process; return what answers tasks."""
+        """Open the scan in this process; return a function that answers tasks."""
         return self.answer_in(self.open_here())
 
     def open_here(self) -> Scan:
@@ -157,7 +160,7 @@ class Localizer:
         return self.open_scan(Workers(self.num_threads))
 
     def answer_in(self, scan: Scan) -> Callable[[Task], Answer]:
-        """Return what answers tasks in an opened scan."""
+        """Return a function that answers tasks in an opened scan."""
         return partial(self.answer, scan, Others(scan, self.ask_by_result))
 
     def open_scan(self, workers: Workers) -> Scan:
@@ -171,7 +174,7 @@ class Localizer:
         return replace(scan, name=self.name)
 
     def answer(self, scan: Scan, others: Others, task: Task) -> Answer:
-        """Localize one photo, and make the pictures asked for; of one that can't be read say why."""
+        """Localize one photo, and make the wanted pictures; the result of an unreadable photo says why."""
         name = task.photo.name
         trace = Trace(self.is_traced)
         with task.place(self.folder) as photo, reading_once():
@@ -193,7 +196,7 @@ class Localizer:
         return Asked(replace(photo, picture=self.folder / photo.path), settings)
 
     def answer_in_order(self, scan: Scan, tasks: Sequence[Task]) -> list[Result]:
-        """Localize photos that were sent together, of the same options, and help each other."""
+        """Localize photos that were sent together with the same options, so that they help each other."""
         with temporary_folder() as folder:
             for task in tasks:
                 task.write_files(folder)
@@ -229,7 +232,7 @@ class Localizer:
         return Answer(unreadable_result(f"{name}: {error}", self.name, name, is_passing=True, **about))
 
     def make_pictures(self, scan: Scan, photo: Photo, result: Result) -> tuple[bytes | None, bytes | None]:
-        """Overlay and occlusion mask as PNG, where they are asked for and there is a pose."""
+        """Return overlay and occlusion mask as PNG, each None if it is not wanted or there is no pose."""
         overlay = mask = None
         pose = result.best_pose
         if pose is None:

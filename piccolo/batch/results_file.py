@@ -1,4 +1,4 @@
-"""Results of a batch, a line a panorama: on a stream, or in a file with which a stopped batch goes on."""
+"""Results of a batch, a line a panorama: on a stream, or in a file from which a stopped batch goes on."""
 
 import json
 from collections import Counter
@@ -14,8 +14,8 @@ from ..together.second_looks import may_change
 
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
 WAYS = "use `overwrite` to start again, or another `out`"
-GROUPS = ("prior", "cloud", "panorama")  # of settings, each of which an option sets
-OPTIONS = ("preset", "gravity", "accuracy", "min_confidence")  # of the other settings those that are options
+GROUPS = ("prior", "cloud", "panorama")  # groups of settings, all of which are options
+OPTIONS = ("preset", "gravity", "accuracy", "min_confidence")  # further settings that are options
 RENAMED = {"scale": "units"}
 Name = TypeVar("Name", Path, str)
 
@@ -33,7 +33,7 @@ def _fields_of(line: bytes, where: str) -> dict[str, Any]:
 
 
 def check_as_expected(fields: Mapping[str, Any], expected: Mapping[str, Any], ways: str = WAYS) -> None:
-    """Refuse a finished line, `fields["line"]`, that is not of the scan and settings expected there."""
+    """Refuse a finished line, `fields["line"]`, that was not made with the expected scan and settings."""
     different = next((key for key in expected if fields.get(key) != expected[key]), None)
     if different is None:
         return
@@ -56,18 +56,18 @@ def describe_changes(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str
 
 
 def _by_option(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the value of each setting by the name of its option in backticks, or by its own."""
+    """Return the value of each setting by the name of its option in backticks, or else by its own name."""
     values = {name: settings[name] for name in settings if name not in (*GROUPS, "method")}
     if "accuracy" in values:
         values["accuracy"] = list(values["accuracy"].values())
-    values |= settings.get("method", {})  # whose numbers no option sets
+    values |= settings.get("method", {})  # no option sets its numbers
     values = {f"`{name}`" if name in OPTIONS else name: value for name, value in values.items()}
     grouped = {name: value for group in GROUPS for name, value in settings.get(group, {}).items()}
     return values | {f"`{RENAMED.get(name, name)}`": value for name, value in grouped.items()}
 
 
 def _say(name: str, value: Any, given: str = "") -> str:
-    """Say what an option is, such as "`focal_px` 1585" or "without `focal_px`"."""
+    """Describe the value of an option, such as "`focal_px` 1585" or "without `focal_px`"."""
     if isinstance(value, dict):
         value = value.get("path", True)  # of a calibration
     if value in (None, False, []):
@@ -84,22 +84,22 @@ class Finished(NamedTuple):
     span: tuple[int, int]  # [byte] in the file
     pano_sha256: str | None
     status: str
-    is_second: bool  # it replaces an earlier one, as the photo was looked at again
+    is_second: bool  # it replaces an earlier line, as the photo was localized again
 
 
 class Records:
-    """Which panoramas have results in a file, and the order in which the lines are to stand at the end."""
+    """The panoramas that have results in a file, and the order that the lines are to have at the end."""
 
     def __init__(self, path: Path | None = None) -> None:
         self.path = path
         self.size = 0  # [byte] of the lines of earlier runs
-        self.order: list[Finished | None] = []  # of the panoramas so far; None for one that is done now
-        self._others: dict[str, list[Finished]] = {}  # by panorama: lines that are in no place of the order
+        self.order: list[Finished | None] = []  # lines of the panoramas so far; None for those of this run
+        self._others: dict[str, list[Finished]] = {}  # by panorama: lines that are not in the order
         self._named: set[str] = set()
 
     @property
     def counts(self) -> Counter[str]:
-        """Results of earlier runs that stay, by status."""
+        """Number of results of earlier runs that are kept, by status."""
         return Counter(line.status for line in self.order if line)
 
     @property
@@ -111,10 +111,10 @@ class Records:
     def read(
         self, expected: Callable[[Path], Mapping[str, Any]], panoramas: Iterable[Path | str] | None
     ) -> None:
-        """Take up what earlier runs have left.
+        """Read the lines that earlier runs have left.
 
-        Raises InputError if a line is not as one of its panorama would be now, or none is of the `panoramas`
-        that are known to come (None: they are not known).
+        Raises InputError if a line was made with other settings than its panorama has now, or if no line is
+        of one of the `panoramas` to come (None: they are not known).
         """
         if self.path is None:
             return
@@ -137,9 +137,10 @@ class Records:
     def remaining(
         self, panoramas: Iterable[Name], compute_digest: Callable[[Name], str | None]
     ) -> Iterator[Name]:
-        """Yield the panoramas without a result, as they come.
+        """Yield the panoramas that have no result, in their order.
 
-        One is done if its line did not fail, and its file has the same digest or can't be read now.
+        A panorama has a result if its line did not fail, and its file has the same digest or can't be read
+        now.
         """
         for pano in panoramas:
             lines = self._others.get(str(pano), [])
@@ -157,7 +158,7 @@ class Records:
                 lines.remove(taken)
 
     def list_unnamed(self) -> list[Finished]:
-        """List the lines of panoramas that were not named, without those that another replaces."""
+        """List the lines of panoramas that were not named, without lines that another line replaces."""
         found = []
         for lines in (self._others[name] for name in self._others.keys() - self._named):
             has_second = any(line.is_second for line in lines)
@@ -166,7 +167,7 @@ class Records:
 
 
 class StreamOutput:
-    """Lines on a stream, in the order of the photos; those behind one that may change wait for it."""
+    """Lines on a stream, in the order of the photos; a line that may change holds back those behind it."""
 
     def __init__(self, write: Callable[[str], object], may_change: bool) -> None:
         self._write = write
@@ -201,7 +202,7 @@ class StreamOutput:
 
 
 class FileOutput:
-    """Lines in a file, each at once on disk; what replaces others, and the order, follow at the end."""
+    """Lines in a file, each at once on disk; replaced lines are dropped and all put in order at the end."""
 
     def __init__(self, file: LineFile, records: Records) -> None:
         self._file = file
@@ -209,7 +210,7 @@ class FileOutput:
         self._replaced: dict[int, tuple[int, int]] = {}  # span [byte] of the newer line of a photo
 
     def begin(self) -> None:
-        """Cut off what is no line of an earlier run, before the first is appended."""
+        """Cut off an incomplete last line of an earlier run, before the first line is appended."""
         self._file.cut(self._records.size)
 
     def write(self, text: str) -> None:
@@ -217,7 +218,10 @@ class FileOutput:
         self._file.append(text)
 
     def _spans(self) -> list[tuple[int, int]]:
-        """Return the span [byte] of each panorama's newest line, in their order; this run's are behind."""
+        """Return the span [byte] of each panorama's newest line, in the order of the panoramas.
+
+        The lines of this run stand behind those of earlier runs.
+        """
         begin = self._records.size
         new_lines = whole_lines(self._file.path, self._file.size, begin)
         new_spans = pairwise(accumulate(map(len, new_lines), initial=begin))
@@ -229,15 +233,15 @@ class FileOutput:
         return [Result.from_json(self._file.read(*span).decode()) for span in self._spans()]
 
     def replace(self, number: int, text: str) -> None:
-        """Append a line that is to replace that of a photo, by its number in the order."""
+        """Append a line that is to replace the line of a photo, given by its number in the order."""
         begin = self._file.size
         self._file.append(text)
         self._replaced[number] = begin, self._file.size
 
     def finish(self, keeps_others: bool) -> int:
-        """Put the lines of the panoramas into their order, and drop older ones.
+        """Put the lines of the panoramas into their order, and drop the lines that were replaced.
 
-        Those of panoramas that were not named are kept before them, or dropped; returns how many were.
+        Lines of panoramas that were not named are kept before all others, or dropped; returns how many were dropped.
         """
         others = self._records.list_unnamed()
         kept = sorted(line.span for line in others) if keeps_others else []
