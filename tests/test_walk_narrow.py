@@ -25,7 +25,7 @@ from piccolo.together.walk.expectation import (
 )
 from piccolo.together.walk.following import (
     KnownPoses,
-    choose_held,
+    choose_accepted,
     compute_gain,
     find_near,
     join_beside,
@@ -179,8 +179,8 @@ def test_other_ends_make_a_narrow_photo_less_sure(seen):
     near = State(tracked.off(seen[1], 0.05, 0.0), 1.0)
     far = State(tracked.off(seen[1], 0.2, 0.0), 1.5)
     best = State(seen[1], 2.0)
-    assert choose_held([near, best]) == best
-    weighed = choose_held([near, best, far])
+    assert choose_accepted([near, best]) == best
+    weighed = choose_accepted([near, best, far])
     assert (weighed.pose, weighed.log_odds) == (seen[1], pytest.approx(2.0 - np.log1p(np.exp(1.5))))
 
 

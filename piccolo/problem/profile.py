@@ -95,9 +95,7 @@ class Profile:
     follows_walls: bool = False  # its lines are turned along the walls of the scan, at one tilt after another
     looks_first: bool = True  # unless its tilt is unknown, a brief look by whole views may settle it
     is_always_upright: bool = False  # it is searched as upright too if its tilt is said to be unknown
-    default_tilt: Tilts = (
-        "known"  # as which it is searched if nothing tells its tilt: upright, or about level
-    )
+    default_tilt: Tilts = "known"  # how a photo of unknown tilt is searched: as upright, or about level
     thins_starts: bool = True  # it has fewer starts where there are few candidates
     starts_apart: Nearness = STARTING  # starts nearer to each other count as one
     subtracts_means: bool = False  # of views and photo, from the correlation of wide cells

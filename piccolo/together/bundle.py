@@ -117,9 +117,7 @@ def judge_members(
         return {k: refuse(member, reason) for k, member in members.items()}
     supports = tested[best]
     agreed = agree(members, bundles[best], supports, errors)
-    if not isinstance(
-        agreed, str
-    ):  # photos that were not found are refined again, from the pose that the others expect
+    if not isinstance(agreed, str):  # photos not found are refined where the others expect them
         near = agreed.adjusted.bundle
         supports |= {
             k: find_supports(
@@ -144,7 +142,7 @@ def judge_members(
 
 
 def list_neighbors(members: dict[int, PosedMember], k: int) -> list[Pose]:
-    """Return the relative poses of the photos next in order to photo `k`, which it may have got by mistake."""
+    """Return the relative poses of the photos next to photo `k`, which it may have got by mistake."""
     others = sorted((j for j in members if j != k), key=lambda j: abs(j - k))
     return [members[j].cam_from_bundle for j in others[:NUM_EXCHANGED]]
 
@@ -152,7 +150,7 @@ def list_neighbors(members: dict[int, PosedMember], k: int) -> list[Pose]:
 def agree(
     members: dict[int, PosedMember], bundle: Bundle, supports: dict[int, Support], errors: RelativeErrors
 ) -> Agreed | str:
-    """Adjust the bundle to photos whose own poses agree with it; return a text if it is not believed.
+    """Adjust the bundle to the photos that agree with it; return the reason if it is not believed.
 
     The errors of the relative poses are estimated from the photos' own poses. Then each own pose gets the
     errors of a local optimum too, in proportion to the probability that it is one.

@@ -1,1 +1,1 @@
-"""Colours for scans from localized photos, and poses of photos from the colours that others give."""
+"""Colours for scans from localized photos, and poses of photos in the colours that other photos give."""

@@ -1,10 +1,11 @@
-"""Align localized photos with each other on the surfaces of a scan: where they look together, they agree.
+"""Align localized photos with each other, so that they show the same colours on the surfaces of a scan.
 
-Minimised is the sum over points, and over the pairs of photos that see them, of a robust loss of the
-difference of their colours, with each pose's distance from where it was found before. All poses are
-optimised jointly, because overlapping photos are coupled. After Zhou and Koltun, "Color Map Optimization
-for 3D Reconstruction with Consumer Depth Cameras" (SIGGRAPH 2014), who move one at a time. Before, gains make
-their exposures alike. A photo sees the nearest surfaces, best where it looks at them squarely from near.
+The sum over points, and over the pairs of photos that see them, of a robust loss of the difference of their
+colours is minimised, with a charge for each pose's distance from where it was found before. All poses are
+optimised jointly, because overlapping photos are coupled. After Zhou and Koltun, "Color Map Optimization for
+3D Reconstruction with Consumer Depth Cameras" (SIGGRAPH 2014), who move one photo at a time. First, the
+colours of each photo are multiplied by gains that make the exposures alike. A photo sees the nearest
+surfaces, best where it looks at them squarely from near.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -32,24 +33,24 @@ LEAST_ALIGNED_POINTS = 40_000
 MOST_SEEN = 6  # photos that count for a point: those that see it best
 PHOTOS_AT_ONCE = 16  # photos whose weights for all points are held
 LOSS_SCALE = 20.0  # [8-bit levels] of the length of a colour difference
-NOISE = 10.0  # [8-bit levels] of one
-NUM_ALIKE = 30.0  # points that count as one: their errors are alike; with fewer, they outweigh the anchors
+NOISE = 10.0  # [8-bit levels] of the length of a colour difference
+NUM_ALIKE = 30.0  # points that count as one, as their errors are alike; if less, points outweigh the anchors
 NUM_ALIGNMENT_STEPS = 15  # a round, at most
 ALIGNMENT_SETTLED = 1e-4  # [rad, m] the largest part of a step after which a round ends
-DARKEST = 8.0  # [8-bit levels] darker and brighter colours say nothing of gains
+DARKEST = 8.0  # [8-bit levels] gains are not estimated from darker colours, nor from the brightest
 BRIGHTEST_LEVEL = 247.0
-SCALE = 0.2  # of the logarithm of a ratio, beyond which it counts little: the photos show different things
+SCALE = 0.2  # of a ratio's logarithm: a larger one counts little, as the photos show different things
 NUM_ALIGNMENT_ROUNDS = 4
 SIGHT_WIDTH = 1024  # [px] of the sphere on which ranges are found
 HIDDEN_BEYOND = np.float32(1.02)  # a point is hidden beyond the surface's range times this
-BEHIND_OFFSET = np.float32(0.03)  # [m] plus this
-NEIGHBOR = 2  # [px] between the pixels by which a surface's slope is found
+BEHIND_OFFSET = np.float32(0.03)  # [m] plus this distance
+NEIGHBOR = 2  # [px] from a pixel to those by which its surface's slope is found
 LEAST_COSINE = 0.02
 LEAST_COUNTED_RANGE = 0.3  # [m] nearer surfaces count as much as this
 
 
 class Anchor(NamedTuple):
-    """The pose at which a photo was found, and how sure that is."""
+    """The pose at which a photo was found, and how exact it is."""
 
     pose: Pose  # in the map
     information: Array  # (6, 6) of a step [rad, m] in the camera's frame
@@ -63,7 +64,7 @@ class Sight(NamedTuple):
 
 
 def look(octree: Octree, pose: Pose) -> Sight:
-    """Return what a photo at a pose in the map sees."""
+    """Return the surfaces that a photo at a pose in the map sees."""
     ranges = render_gray(octree, pose, np.ones((SIGHT_WIDTH // 2, SIGHT_WIDTH), np.bool_)).ranges
     rays = pixel_rays(SIGHT_WIDTH)
     smooth = np.asarray(cv2.medianBlur(ranges, 3), np.float64)
@@ -94,12 +95,12 @@ def weigh_points(
 
 
 class Sightings(NamedTuple):
-    """Which photos see which points; of point n those from first[n] to first[n + 1], in order of photos."""
+    """Which photos see which points: those of point n are first[n] to first[n + 1], in order of photos."""
 
     first: Int64s  # (N + 1,)
     point: Int64s  # (S,)
     photo: Int64s  # (S,)
-    own: list[Int64s]  # those of each photo
+    own: list[Int64s]  # indices of the sightings of each photo
 
 
 class Readings(NamedTuple):
@@ -132,7 +133,7 @@ def align(
 
 
 def find_sightings(octree: Octree, points: Array32, poses: Sequence[Pose], workers: Workers) -> Sightings:
-    """Find which photos see points (N, 3), those alone that several see."""
+    """Find which photos see points (N, 3); points that fewer than two photos see are left out."""
 
     def weigh(pose: Pose) -> Array32:
         found = np.empty(len(points), np.float32)
@@ -145,7 +146,7 @@ def find_sightings(octree: Octree, points: Array32, poses: Sequence[Pose], worke
 
 
 def keep_best(weights: Iterable[Array32], num_points: int, num_photos: int) -> Sightings:
-    """Keep the photos that see each point best, by weights (N,) of each photo; 0 of points not seen."""
+    """Keep the photos that see each point best, by weights (N,) of each photo, 0 for points not seen."""
     best = np.zeros((num_points, MOST_SEEN), np.float32)
     photos = np.full(best.shape, num_photos)
     for k, found in enumerate(weights):
@@ -255,7 +256,7 @@ def add_pairs(
 ) -> float:
     """Add the normal equations (6 K, 6 K), (6 K,) of the pairs of sightings of each point; return the loss.
 
-    The pairs of a point seen by n photos count 1 / n, so that all together count as n - 1 colours.
+    Each pair of a point that n photos see counts 1 / n, so that its pairs weigh as much as n - 1 colours.
     """
     total = 0.0
     per_scale2 = np.float32(1.0 / (scale * scale))
@@ -290,7 +291,7 @@ def add_pair(
     matrix: Array,
     gradient: Array,
 ) -> None:
-    """Add the equations of one difference, by its derivatives (6,) by the steps at i and, negative, at j."""
+    """Add the equations of one difference, with the derivatives (6,) `row` for photo i and -`other` for j."""
     for p in range(6):
         gradient[i + p] += weight * error * row[p]
         gradient[j + p] -= weight * error * other[p]
@@ -305,8 +306,8 @@ def add_pair(
 def balance(point: Int64s, photo: Int64s, values: Array32, num_photos: int) -> Array32:
     """Return the gains (photos, 3) by which the colours of photos are multiplied to be alike.
 
-    `values` (S, 3) are what `photo` (S,) shows at `point` (S,), sorted by points. The logarithms of gains are
-    found by robust least squares on those of ratios, their mean is 0.
+    `values` (S, 3) are the colours that `photo` (S,) shows at `point` (S,), sorted by points. The logarithms
+    of the gains are found by robust least squares on the logarithms of ratios of colours; their mean is 0.
     """
     is_plain = np.asarray(np.all((values > DARKEST) & (values < BRIGHTEST_LEVEL), axis=1))  # not NaN either
     logs = np.log(np.where(is_plain[:, None], values, 1.0).astype(np.float64))

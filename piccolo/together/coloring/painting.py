@@ -1,7 +1,7 @@
 """A scan in the colours of photos that were localized in it, by its shape or by colours it has already.
 
-A point's colour is the weighted median of the photos that see it, so that no single photo decides; parts that
-the others contradict do not count.
+A point's colour is the weighted median of the photos that see it, so that no single photo decides. Parts of a
+photo that other photos contradict do not count.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -34,21 +34,21 @@ from .passersby import remove_passersby
 
 LEAST_COLORING_PHOTOS = 2
 NUM_COLORING_ROUNDS = 2  # in which photos are localized by the colours of the round before
-MOST_FOLDS = 8  # of photos that do not see each other's paint: each fold has a map of its own
-PIXEL_BYTES = 8  # of a photo that gives colours: RGB, whether it counts, and both packed
-PHOTO_BYTES = 40e6  # beside: its smaller copy, ranges around it, and its share of points that are aligned
-PAIR_BYTES = 5 * 6 * 6 * 8  # of two photos: normal equations, and copies of them in a step
+MOST_FOLDS = 8  # groups of photos; each is localized in a map that has no paint of the group's own photos
+PIXEL_BYTES = 8  # a pixel of a photo that gives colours: RGB, whether it counts, and both packed
+PHOTO_BYTES = 40e6  # further, a photo: its smaller copy, ranges around it, and its share of aligned points
+PAIR_BYTES = 5 * 6 * 6 * 8  # a pair of photos: normal equations, and copies of them in a step
 UNKNOWN_STD = np.radians(0.5), 0.03  # [rad], [m] of a pose without a covariance
-PAINT_STD = 0.008  # [m] of positions in a scan whose colours are all of photos that found each other
+PAINT_STD = 0.008  # [m] of positions in a scan that the localized photos have coloured themselves
 PAINTED = "photos are localized by the colours that others gave to the scan"
 MAX_COLORING_WIDTH = 4096  # [px] of a photo, at most
-SAMPLES = 1 << 21  # of photos at points, that a task holds
-LEAST_PAINTED = 0.25  # of what a photo sees that must have paint; with less, most right ones were refused
-MOST_PHOTOS = 255  # that are counted for a point
+SAMPLES = 1 << 21  # colours of photos at points that a task holds
+LEAST_PAINTED = 0.25  # share of what a photo sees that must have paint; with less, most were refused
+MOST_PHOTOS = 255  # largest number of photos that is counted for a point
 FULL_LEVEL = np.float32(255.0)
 
 
-Localize = Callable[[ScanMap, int], Result]  # a photo by its number, in the map or in one of other colours
+Localize = Callable[[ScanMap, int], Result]  # localizes a photo, by its number, in a map with some colours
 OF_RESULTS = {"colors": "those of the other photos"}  # settings that results repeat
 
 
@@ -64,8 +64,8 @@ class Brush(NamedTuple):
 class Paint(NamedTuple):
     """Colours of points."""
 
-    colors: Bytes  # (N, 3) RGB, 0 where no photo looks
-    num_photos: Bytes  # (N,) that see the point
+    colors: Bytes  # (N, 3) RGB, 0 where no photo sees the point
+    num_photos: Bytes  # (N,) photos that see the point
 
 
 def make_brushes(
@@ -119,7 +119,7 @@ def read_colors(
     weights: Array32,
     colors: Array32,
 ) -> None:
-    """Write what a photo shows at points (N, 3) whose weights (N,) are above 0; masked, they become 0."""
+    """Write a photo's colours at points (N, 3) with weights (N,) above 0; masked, weights become 0."""
     pose = texels.pose_float32(R_cam_from_map, center_map)
     for n in range(len(points)):
         if weights[n] <= F0:
@@ -173,7 +173,7 @@ class Colored(NamedTuple):
 
     num_photos: int
     num_points: int
-    num_colored: int  # points that a photo sees
+    num_colored: int  # points that at least one photo sees
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ class Coloring:
 
     results: list[Result]  # one of each photo, in order
     num_points: int  # of the scan that was written; 0 if none was, as fewer than two photos are localized
-    num_colored: int  # of these, that a photo sees
+    num_colored: int  # those of these points that at least one photo sees
 
 
 def localize_for_colors(
@@ -195,8 +195,8 @@ def localize_for_colors(
 ) -> list[Result]:
     """Localize photos by a scan as it is, and then in the colours that the others give to it.
 
-    `localize` makes the result of a photo by its number, `steps` names those of the scan as it is. Results
-    that the journal has are not computed again.
+    `localize` returns the result of a photo by its number; `steps` are the journal's names for the results by
+    the scan as it is. Results that the journal has are not computed again.
     """
     names = [*steps]
     by_shape = journal.recall(names, lambda _, text: Result.from_json(text))
@@ -216,8 +216,8 @@ def localize_by_colors(
 ) -> list[Result]:
     """Localize photos in the colours that the others give to a map, by `localize(painted_map, photo)`.
 
-    A photo that is refused there does not paint in the next round. One that sees hardly any paint of others
-    gets its result of `by_shape`. Results that the journal has are not computed again.
+    A photo that is not localized in these colours does not paint in the next round. A photo that sees hardly
+    any paint of others keeps its result of `by_shape`. Results that the journal has are not computed again.
     """
     results = list(by_shape)
     leaves = list_leaves(scan_map)
@@ -253,7 +253,7 @@ def keep_step(journal: Journal, step: str, result: Result) -> None:
 
 
 def color_map(scan_map: ScanMap, paint: Paint, workers: Workers) -> ScanMap:
-    """Return a map in other colours of its leaves; those without get one from around them."""
+    """Return a map with other colours of its leaves; leaves without paint get colours from around them."""
     colors = np.asarray(paint.colors / np.float32(255.0), np.float32)
     painted = recolor(scan_map.octree, colors, (paint.num_photos > 0).astype(np.float32))
     return replace(
@@ -314,7 +314,7 @@ def color_if_enough(
 
 
 def check_point_files(paths: Sequence[Path]) -> None:
-    """Refuse a scan that is not of files of points: a prepared map, or arrays."""
+    """Refuse a scan that was not read from files of points, but from a prepared map or arrays."""
     if find_prepared_map(paths) or not all(path.exists() for path in paths):
         raise InputError(f"{paths[0]}: found no files of points, wanted those of a scan to be coloured")
 
@@ -326,7 +326,7 @@ def check_colored_suffix(out: Path) -> None:
 
 
 def make_aligned_brushes(scan_map: ScanMap, results: Sequence[Result], workers: Workers) -> list[Brush]:
-    """Align the photos that are localized, and return them as what gives colours."""
+    """Align the photos that are localized, and return the brushes that they are."""
     found = [(result, result.pose) for result in results if result.pose is not None]
     if len(found) < LEAST_COLORING_PHOTOS:
         wanted = f"wanted {LEAST_COLORING_PHOTOS} or more for colours"
@@ -347,7 +347,7 @@ def make_aligned_brushes(scan_map: ScanMap, results: Sequence[Result], workers: 
 
 
 def make_anchor(result: Result, pose_world: Pose, pose_map: Pose) -> Anchor:
-    """Return where a result says that the photo was, and how surely."""
+    """Return the pose of a result and how exact it is, as the anchor of its photo."""
     turn, move = UNKNOWN_STD
     covariance = np.diag([turn**2] * 3 + [move**2] * 3)
     if result.covariance is not None:

@@ -1,8 +1,9 @@
 """People and what else moved between photos: parts of them that the others contradict give no colours.
 
-Of three photos of a point, or more, those are outvoted that differ from most. Of two that differ, one is
-blamed as far as it is outvoted around there, at first both. Blame and agreement spread to similar colours
-nearby, by a bilateral filter (Tomasi and Manduchi, ICCV 1998), and so to what one photo alone sees there.
+If three or more photos show a point, those that differ from most of them are outvoted. If two photos show it
+and differ, at first both are blamed, then each as far as it is outvoted around the point. Blame and agreement
+spread to similar colours nearby, by a bilateral filter (Tomasi and Manduchi, ICCV 1998), and so also to
+points that one photo alone shows.
 """
 
 from collections.abc import Sequence
@@ -22,7 +23,7 @@ from ...system.kernels.jit import F0, HALF, kernel
 from .alignment import MOST_SEEN, POINTS_PER_PHOTO, Sightings, find_sightings, read_all
 
 VOTE_WIDTH = 256  # [px] of the cells in which votes are counted: 1.4 degrees each
-LEAST_ASKED_POINTS = 200_000  # that are asked
+LEAST_VOTING_POINTS = 200_000  # points at which votes are cast, at least
 # Chosen on a house whose three photos have six people in one colour, or in clothes of several (CHANGELOG.md);
 # 30 and 40, 20 and 30, 5 and 7, 0.4 and 0.5 differ by 1 % of the points.
 MOST_APART = 40.0  # [8-bit levels] in any channel, between photos that agree
@@ -31,14 +32,14 @@ VOTE_DEVIATION = np.float32(5.0)  # [cells] deviation of distances over which vo
 VOTE_REACH = 12  # [cells] at most
 FEW_VOTES = 1.0  # agreeing votes that every cell has: one contradiction alone says little
 MOST_BLAME = 0.5  # share of votes from which a cell gives no colours
-FIRST_BLAME = 0.1  # before votes are counted
-NUM_BLAME_ROUNDS = 3  # of blame between two photos
-MOST_OF_A_PHOTO = 0.5  # that is blamed; else its light is another
+FIRST_BLAME = 0.1  # of either of two photos that differ, before votes are counted
+NUM_BLAME_ROUNDS = 3  # in which blame is divided between two photos
+MOST_OF_A_PHOTO = 0.5  # share of a photo that may be blamed: if more is, the photo was taken in another light
 BLAME_MARGIN = 1  # [cells] around what is blamed
 
 
 class Votes(NamedTuple):
-    """Whether sightings of points are agreed to by other photos."""
+    """Whether other photos of the same points agree with each sighting."""
 
     is_agreed: Mask  # (S,)
     is_outvoted: Mask  # (S,)
@@ -50,7 +51,7 @@ def remove_passersby(
 ) -> list[Panorama]:
     """Return photos at poses in a map without the parts that the others contradict."""
     leaves = octree.level(octree.leaf_size)
-    num_points = max(LEAST_ASKED_POINTS, POINTS_PER_PHOTO * len(poses))
+    num_points = max(LEAST_VOTING_POINTS, POINTS_PER_PHOTO * len(poses))
     points = np.ascontiguousarray(leaves[:: -(-len(leaves) // num_points), :3])
     sightings = find_sightings(octree, points, poses, workers)
     images = [texels.pack_texels(panorama.rgb, panorama.is_valid) for panorama in panoramas]
@@ -62,10 +63,10 @@ def remove_passersby(
         i, j = compute_indices(rays, VOTE_WIDTH)
         cells[own] = (k * (VOTE_WIDTH // 2) + i) * VOTE_WIDTH + j
     blame = find_blame(cast_votes(sightings, values), cells, [p.rgb for p in panoramas], workers)
-    is_asked = np.bincount(cells, minlength=blame.size).reshape(blame.shape) > 0
+    has_votes = np.bincount(cells, minlength=blame.size).reshape(blame.shape) > 0
     return [
-        without(panorama, is_blamed) if is_blamed[asked].sum() < MOST_OF_A_PHOTO * asked.sum() else panorama
-        for panorama, is_blamed, asked in zip(panoramas, blame > MOST_BLAME, is_asked, strict=True)
+        without(panorama, is_blamed) if is_blamed[voted].sum() < MOST_OF_A_PHOTO * voted.sum() else panorama
+        for panorama, is_blamed, voted in zip(panoramas, blame > MOST_BLAME, has_votes, strict=True)
     ]
 
 
@@ -88,7 +89,7 @@ def cast_votes(sightings: Sightings, values: Array32) -> Votes:
 
 
 def find_blame(votes: Votes, cells: Int64s, pictures: Sequence[Bytes], workers: Workers) -> Array32:
-    """Return the share of contradicting votes (photos, cells down, cells across), near and alike."""
+    """Return the share of contradicting votes (photos, cells down, cells across) of near, similar cells."""
     shape = (len(pictures), VOTE_WIDTH // 2, VOTE_WIDTH)
     num_cells = len(pictures) * (VOTE_WIDTH // 2) * VOTE_WIDTH
     guides = [
@@ -114,7 +115,7 @@ def find_blame(votes: Votes, cells: Int64s, pictures: Sequence[Bytes], workers: 
 
 @kernel
 def spread_votes(votes: Array32, guide: Array32, found: Array32) -> None:
-    """Write the sums of votes (H, W, 2) around each cell, by nearness and likeness in a picture (H, W, 3)."""
+    """Write the sums of votes (H, W, 2) around each cell, weighted by distance and by colour (H, W, 3)."""
     height, width = votes.shape[:2]
     for i in range(height):
         for j in range(width):

@@ -1,4 +1,4 @@
-"""Decisions on values: the pose that a frame is expected to have, where tracking starts, which end counts."""
+"""Where a frame of a walk is expected, from where it is tracked, and which end of tracking counts."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,15 +11,15 @@ from .frames import MOST_EXPECTED, Frame, How, Motion, State
 from .path import COPY_LOG_ODDS
 
 NUM_NARROW = 4  # chosen: places within reach from which a narrow photo is tracked
-Place = tuple[Pose, float]  # in the map, as rough as the grid of candidates; log odds against the frame's own
+Place = tuple[Pose, float]  # pose in the map, as rough as the candidates' grid; log odds against another pose
 
 
 class ExpectedFrame(NamedTuple):
-    """The pose that a frame is expected to have, from the pose of another, and its limits."""
+    """The pose that a frame is expected to have, from the pose of another, and how far it may be away."""
 
-    last: Pose  # of the other frame, moved by the odometry if there is one
-    reach: float  # [m] from there
-    pose: Pose  # predicted
+    last: Pose  # pose of the other frame, moved by the odometry if there is one
+    reach: float  # [m] that the frame may be from `last`
+    pose: Pose  # the predicted pose
 
     def is_within(self, pose: Pose) -> bool:
         """Return True for a pose within reach."""
@@ -30,19 +30,19 @@ class Start(NamedTuple):
     """A pose from which a frame is tracked."""
 
     pose: Pose
-    must_be_sure: bool  # the end counts only if the photo is sure of it by itself
+    must_be_sure: bool  # the end of tracking counts only if the photo is sure of it by itself
 
 
 class Followed(NamedTuple):
-    """The pose of a frame that was found from another's."""
+    """The pose of a frame that was found from another frame's pose."""
 
     state: State
     how: How
-    is_alone: bool  # False if it may be at another place within reach
+    is_alone: bool  # False if the frame may be at another place within reach
 
 
 def expect(frame: Frame, near: Sequence[tuple[Frame, Pose]], motion: Motion) -> ExpectedFrame:
-    """Predict where a frame is from others, the last of them first: by odometry or at constant velocity."""
+    """Predict a frame's pose from other frames, the latest first: by odometry or at constant velocity."""
     before, last = near[0]
     seconds = frame.time - before.time
     reach = motion.reach(seconds)
@@ -74,14 +74,14 @@ def list_alike(expected: ExpectedFrame, places: Sequence[Place]) -> list[Pose]:
 
 
 def list_starts(
-    expected: ExpectedFrame, behind: float, alike: Sequence[Pose], is_narrow: bool, told: Sequence[Pose] = ()
+    expected: ExpectedFrame, behind: float, alike: Sequence[Pose], is_narrow: bool, known: Sequence[Pose] = ()
 ) -> list[Start]:
-    """Return from where a frame is tracked, in order, until an end holds.
+    """Return the poses from which a frame is tracked, in the order in which they are tried.
 
-    `behind` are the odds [log] by which the expected pose looks worse than the best place. A narrow photo,
-    of which views tell little, has more starts, of which `told` are those by other evidence.
+    `behind` are the odds [log] by which the expected pose looks worse than the best place. Views determine
+    little of a narrow photo, so that it has more starts, also the poses `known` by other evidence.
     """
-    others = [*filter(expected.is_within, told), *alike[:NUM_NARROW]] if is_narrow else alike[:1]
+    others = [*filter(expected.is_within, known), *alike[:NUM_NARROW]] if is_narrow else alike[:1]
     best = [Start(pose, False) for pose in others]
     if behind > -COPY_LOG_ODDS:
         return [Start(expected.pose, False), *best]

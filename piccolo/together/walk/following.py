@@ -1,4 +1,4 @@
-"""A frame that is found from others: where it was expected, or at the best place within reach."""
+"""A frame that is found from other frames: where it was expected, or at the best place within reach."""
 
 import math
 from collections.abc import Sequence
@@ -28,28 +28,29 @@ from .expectation import ExpectedFrame, Followed, describe_end, is_acceptable, l
 from .frames import MOST_EXPECTED, State, log_ratio, put_state
 from .places import list_places, log_behind, narrow_down
 
-LEAST_SCORE = 0.05  # of a tracked pose: with less it explains nothing
+LEAST_SCORE = 0.05  # of a tracked pose: with a lower score it explains nothing
 
 
 class KnownPoses(NamedTuple):
-    """Poses that are known where a narrow photo is looked for."""
+    """Poses that help to track a narrow photo."""
 
-    known: Sequence[Pose] = ()  # at which it was found before
+    known: Sequence[Pose] = ()  # poses at which it was found before
     beside: Sequence[PoseGaussian | None] = ()  # poses of the photos beside, with which it is matched
 
 
-NOTHING_TOLD = KnownPoses()
+NO_KNOWN_POSES = KnownPoses()
 
 
 def find_near(
-    problem: Problem, expected: ExpectedFrame, means: Means, told: KnownPoses = NOTHING_TOLD
+    problem: Problem, expected: ExpectedFrame, means: Means, poses: KnownPoses = NO_KNOWN_POSES
 ) -> Followed | None:
-    """Track a frame from the expected pose, if that looks hardly worse than the best place within reach.
+    """Track a frame from the expected pose, or from the best place within reach.
 
-    Else, or if that fails, it is tracked from that place. An end away from the expected pose counts only if
-    the photo is sure of it by itself; and so does an end at an expected pose that looks worse, which is tried
-    last with a narrow photo. That has more starts, until one end is sure; the likeliest counts. None if none
-    holds, or if the mirrored photo fits better.
+    The expected pose is the first start if it looks hardly worse than the best place; if tracking from it
+    fails, or if it looks worse, the frame is tracked from that place. An end away from the expected pose
+    counts only if the photo is sure of it by itself. A narrow photo has further starts, the last at an
+    expected pose that looks worse, whose end counts only if the photo is sure of it. All are tried until one
+    end is sure; the likeliest end counts. Return None if no end counts, or if the mirrored photo fits better.
     """
     near, effort = narrow_down(problem, expected.last, expected.reach, means.effort)
     workers = means.workers
@@ -61,27 +62,27 @@ def find_near(
     best_score = max(ends.best_score, score)
     behind = log_behind(problem, score, best_score)
     alike = list_alike(expected, list_places(problem, ends, best_score))
-    others = [*propose_beside(problem, workers), *told.known] if is_narrow else []
-    held: list[State] = []
+    others = [*propose_beside(problem, workers), *poses.known] if is_narrow else []
+    accepted: list[State] = []
     for start in list_starts(expected, behind, alike, is_narrow, others):
         end = track(problem, start.pose, workers)
         if end is not None and is_acceptable(end, expected, start.must_be_sure):
-            held.append(end)
+            accepted.append(end)
             if not is_narrow or end.log_odds >= SURE_ODDS:
                 break
-    if not held:
+    if not accepted:
         return None
-    best = choose_held(held)
+    best = choose_accepted(accepted)
     share = 1.0
     if problem.profile.is_partial:
-        best, share = join_beside(problem, best, told.beside)
+        best, share = join_beside(problem, best, poses.beside)
     return describe_end(replace(best, gain=share * compute_gain(problem, near)), expected, alike)
 
 
-def choose_held(held: Sequence[State]) -> State:
-    """Return the likeliest of the ends that hold; the others are evidence against it."""
-    best = max(held, key=lambda state: state.log_odds)
-    others = sum(math.exp(state.log_odds) for state in held if not RIGHT.holds(state.pose, best.pose))
+def choose_accepted(ends: Sequence[State]) -> State:
+    """Return the likeliest of the ends that count; ends at other poses are evidence against it."""
+    best = max(ends, key=lambda state: state.log_odds)
+    others = sum(math.exp(state.log_odds) for state in ends if not RIGHT.holds(state.pose, best.pose))
     return replace(best, log_odds=best.log_odds - math.log1p(others))
 
 
@@ -92,7 +93,7 @@ def propose_beside(problem: Problem, workers: Workers) -> list[Pose]:
 
 
 def compute_gain(problem: Problem, near: Problem) -> float:
-    """Return what a frame gains [log] if it is found among few places: the less is that by chance."""
+    """Return the log odds that a frame gains if it is found among few places, as chance is less likely."""
     share = len(near.scan_map.sparse) / len(problem.scan_map.sparse)
     return min(-math.log(share), MOST_EXPECTED)
 
@@ -100,10 +101,11 @@ def compute_gain(problem: Problem, near: Problem) -> float:
 def join_beside(
     problem: Problem, own: State, of_others: Sequence[PoseGaussian | None]
 ) -> tuple[State, float]:
-    """Return the mean of a frame's pose and of that by the first photo beside whose matches confirm it.
+    """Return the mean of a frame's pose and of the pose by a photo beside, the first that confirms it.
 
-    Return also the probability that this confirms the pose; 0 without one. Else a narrow photo gains nothing
-    by being found within reach: it may look the same at two poses near each other.
+    Return also the probability that the photo beside confirms the pose; 0 if none does. A narrow photo that
+    is not confirmed gains nothing by being found within reach: it may look the same at two poses near each
+    other.
     """
     for matches, gaussian in zip(problem.beside, of_others, strict=True):
         confirmed = confirm(matches, own.pose, problem.method.sure_matches) if gaussian else None
@@ -117,15 +119,15 @@ def join_beside(
             if fused is None:
                 continue
             mean = fused
-        share = probability_near(mean.pose, expected, RIGHT)  # of the place, however exact it must be
+        share = probability_near(mean.pose, expected, RIGHT)  # of the place, whatever accuracy is wanted
         return replace(own, pose=mean.pose, gaussian=mean), share
     return own, 0.0
 
 
 def track(problem: Problem, start: Pose, workers: Workers) -> State | None:
-    """Refine a pose; None if the end more likely is wrong than right, or explains nothing.
+    """Refine a pose; None if the end is more likely wrong than right, or explains nothing.
 
-    A narrow photo is tracked again from where its matches put it.
+    A narrow photo is tracked again from the pose by its matches.
     """
     ends = [refine_near(problem, start, workers)]
     if problem.profile.is_narrow:
@@ -136,7 +138,7 @@ def track(problem: Problem, start: Pose, workers: Workers) -> State | None:
 
 
 def choose_end(ends: Sequence[Near]) -> State | None:
-    """Return the likeliest end; None if it more likely is wrong than right, or explains nothing."""
+    """Return the likeliest end; None if it is more likely wrong than right, or explains nothing."""
     odds = [log_ratio(near.place, 1.0 - near.place) for near in ends]
     best = int(np.argmax(odds))
     end, gaussian, _ = ends[best]
@@ -145,9 +147,10 @@ def choose_end(ends: Sequence[Near]) -> State | None:
 
 
 def refine_state(problem: Problem, states: Sequence[State], rough: State, workers: Workers) -> list[State]:
-    """Refine a rough state; its odds are then relative to those of the best refined one, by whole views.
+    """Refine a rough state; return all states.
 
-    It is dropped if a frame would not be tracked there, or has that pose already.
+    Its odds are then those of the best refined state, times the ratio of the two by whole views. The state is
+    dropped if tracking from it fails, or ends at the pose of another state.
     """
     best = max((s for s in states if s.is_refined), key=lambda s: s.log_odds)
     end = track(problem, rough.pose, workers)

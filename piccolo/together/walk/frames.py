@@ -1,8 +1,8 @@
 """The frames of a walk: the poses that each may have, and their odds; and the motion of the camera.
 
 A key frame was compared with the whole scan: its states are all the places that look like its photo, each
-once, most of them as rough as the grid of candidates. The frames after it are tracked, and have one pose
-each: wherever the key frame is, their motion from it is the same.
+once, most of them only as exact as the grid of candidates. The frames after it are tracked, and have one pose
+each: their motion relative to the key frame is the same, wherever the key frame is.
 """
 
 import math
@@ -26,7 +26,7 @@ from ...system.arrays import Array
 from ...system.errors import InputError
 
 How = Literal["alone", "near", "tracked", "none"]
-MOST_EXPECTED = 3.0  # [log] that a frame gains at most by being where it was to be expected
+MOST_EXPECTED = 3.0  # [log] that a frame gains at most by being where it was expected
 MOST_ODDS = 8.0  # [log] that one frame may add: errors outside the model allow no more certainty
 MAX_ACCELERATION = 2.0  # [m/s^2]
 REACH_SLACK = COARSE_SPACING / 2.0  # [m] beyond what a person walks: places are as rough as their grid
@@ -39,14 +39,14 @@ class State:
 
     pose: Pose  # in the map's frame
     log_odds: float  # against none of the frame's poses being right
-    score: float | None = None  # as of Evidence; None of a pose that was not refined
+    score: float | None = None  # as in Evidence; None if the pose was not refined
     gaussian: PoseGaussian | None = None  # the pose with its covariance, in the map
-    end: Candidate | None = None  # where the photo was tracked to; None of one that was searched
-    gain: float = 0.0  # [log] of one that was found among the few places within reach
+    end: Candidate | None = None  # the end of tracking; None if the pose was found by a search
+    gain: float = 0.0  # [log] for being found among the few places within reach
 
     @property
     def is_refined(self) -> bool:
-        """True if the pose is as good as that of a photo alone."""
+        """True if the pose was refined as that of a photo alone is."""
         return self.score is not None
 
     @property
@@ -62,11 +62,11 @@ class Frame:
     time: float  # [s] from any beginning
     states: list[State] = field(default_factory=list)
     how: How = "none"
-    alone: Result | None = None  # if it was searched without regard to the others
+    alone: Result | None = None  # the result without the other frames, if it was searched so
     is_key: bool = False
     key: int | None = None  # number of the key frame from which it was tracked, perhaps by way of others
-    arrived: Pose | None = None  # pose that tracking gave, supposing that the key frame is at its `departed`
-    departed: Pose | None = None  # of a key frame, where the frames after it were tracked from
+    arrived: Pose | None = None  # pose by tracking from the key frame, if this is at its `departed`
+    departed: Pose | None = None  # pose of a key frame from which the frames after it were tracked
     odometry: Pose | None = None  # in the frame of the odometry [m]
 
     @property
@@ -76,7 +76,7 @@ class Frame:
 
     @property
     def is_sure(self) -> bool:
-        """True if it is sure of any of its poses, at the place from which it was tracked."""
+        """True if the photo is sure of any pose, supposing that the place it was tracked from is right."""
         return any(state.is_sure for state in self.states)
 
     @property
@@ -91,7 +91,7 @@ class Frame:
 
 
 def list_states(scan_map: ScanMap, found: Result) -> list[State]:
-    """List a frame's poses by its own localization; alternatives, whose covariance is unknown, are rough."""
+    """List a frame's poses by its own localization; the alternatives, without covariance, count as rough."""
     if found.best_pose is None or found.evidence is None:
         return []
     poses = [found.best_pose, *(alternative.pose for alternative in found.alternatives)]
@@ -108,7 +108,7 @@ def log_ratio(probability: float, other: float) -> float:
 
 
 def put_state(states: Sequence[State], state: State) -> list[State]:
-    """Return the states with another in place of those that are the same pose."""
+    """Return the states with another one, which replaces those at the same pose."""
     return [state, *(s for s in states if not ONE_ANSWER.holds(s.pose, state.pose))]
 
 
@@ -151,7 +151,7 @@ class Motion:
         return self.max_speed or (MAX_SPEED if self.is_timed else MAX_STEP)
 
     def reach(self, seconds: float) -> float:
-        """Return how far [m] the camera may be from where it was so long ago, or later."""
+        """Return how far [m] the camera may be from where it was `seconds` before or after."""
         return self.speed * abs(seconds) + REACH_SLACK
 
     @property

@@ -1,12 +1,14 @@
 """The path through the places of a walk's key frames: Markov localization (Fox, Burgard and Thrun, 1999).
 
 Each key frame has a likelihood over the whole map, kept where it is not negligible. The camera walks from
-place to place through free space, or as tracking or an odometry says; anything else is a jump, at a price if
-the frames have times. A frame may also have none of its places, and the path goes on from an earlier one.
+place to place through free space, or moves as tracking or an odometry measured; anything else is a jump, with
+low odds if the frames have times. A frame may also be at none of its places: the path then goes on from an
+earlier frame.
 Forward-backward (Rabiner 1989) finds the probability of each place.
 
-Frames of one place have correlated errors: key frames are some distance apart, and they tell places apart
-only beyond the differences between exact copies of a room. What a frame may be follows from the path.
+Frames of one place have correlated errors. So key frames are some distance apart, and differences of odds as
+small as between exact copies of a room do not distinguish places. The probabilities of a frame's poses follow
+from the path.
 """
 
 import math
@@ -24,20 +26,20 @@ from ...scan_map.camera_positions import FreeSpace
 from ...system.arrays import Array, Mask
 from .frames import JUMP_LOG, MOST_EXPECTED, MOST_ODDS, REACH_SLACK, Frame, Motion, State, state_centers
 
-EVEN = 0.5  # less is not sure
+EVEN = 0.5  # probability: with less, a pose is more likely wrong than right
 COPY_LOG_ODDS = 3.0  # copies of a place differ by less (2.1 in 50 probes), if one of them was scanned better
 NEGLIGIBLE = -2.0 * JUMP_LOG  # [log] a way that leaves out more evidence is worse than two jumps
-DRIFT = 0.05  # of the path that an odometry measures, that it may be off
+DRIFT = 0.05  # error of an odometry, as a share of the path that it measures
 
 
 class Path(NamedTuple):
-    """The probabilities of the places of a walk's key frames; of other frames there is nothing."""
+    """The probabilities of the places of a walk's key frames; other frames have empty arrays."""
 
     probabilities: list[Array]  # (S,) of each frame's states
     gaps: list[Gap | None]  # before each frame, if the frames have times
 
     def choose(self, k: int) -> int | None:
-        """Return the likeliest state of a frame; None if more likely it has none of them."""
+        """Return the likeliest state of a frame; None if it is more likely at none of them."""
         found = self.probabilities[k]
         return int(found.argmax()) if found.sum() > EVEN else None
 
@@ -66,7 +68,8 @@ def emissions(frame: Frame, tracked: float = -math.inf) -> tuple[Array, float]:
     """Return log odds (S,) of a key frame's states against none.
 
     The odds of the frame's best state, or of the best frame tracked from it if greater, are divided among its
-    states: less for those behind the best. The second result is the log of the effective number of them.
+    states: states that look worse than the best get less. The second result is the log of the effective
+    number of states.
     """
     odds = np.array([state.log_odds for state in frame.states])
     tolerance = 0.0 if frame.is_localized_alone else COPY_LOG_ODDS
@@ -86,9 +89,10 @@ def log_transition(distance: Array, seconds: float, motion: Motion, expected: Ar
 
 
 def motion_between(frames: Sequence[Frame], m: int, k: int) -> tuple[Pose, Pose, float] | None:
-    """Return two poses that differ as the camera moved from a key frame to another, and their error [m].
+    """Return two poses that differ by the camera's motion from a key frame to another, and their error [m].
 
-    By tracking, if it led from the one to the other, else by odometry; None if neither did.
+    The motion is that of tracking, if it led from the one to the other, else that of the odometry; None if
+    there is neither.
     """
     before, frame = frames[m], frames[k]
     end = track_back(frames, m, k)
@@ -103,7 +107,7 @@ def motion_between(frames: Sequence[Frame], m: int, k: int) -> tuple[Pose, Pose,
 
 
 def track_back(frames: Sequence[Frame], m: int, k: int) -> Pose | None:
-    """Return where a frame was tracked to from key frame `m`, by way of later ones; None if it was not."""
+    """Return the pose of frame `k` by tracking from key frame `m`, perhaps through later ones, or None."""
     key = frames[k].key
     arrived = frames[k].arrived
     if key is None or arrived is None or not m < key < k:
@@ -114,7 +118,7 @@ def track_back(frames: Sequence[Frame], m: int, k: int) -> Pose | None:
 
 
 def is_moved(moved: tuple[Pose, Pose, float], starts: Sequence[State], ends: Sequence[State]) -> Mask:
-    """Return True (S, N) for the steps that are as a known motion."""
+    """Return True (S, N) for the steps from starts to ends that agree with a known motion."""
     begin, end, error = moved
     carried = [carry(end, begin, state.pose) for state in starts]
     centers = np.array([pose.center_world for pose in carried])
@@ -144,7 +148,7 @@ class Lattice:
             self._append_column(len(self.frames) - 1, tracked)
 
     def change_last(self) -> None:
-        """Take note that the last frame, a key frame, has other states."""
+        """Compute the last frame's column again, as this key frame has other states now."""
         self.columns.pop()
         self.ended.pop()
         self._append_column(len(self.frames) - 1)
@@ -173,7 +177,7 @@ class Lattice:
         return steps
 
     def _step_once(self, column: _Column, k: int, most_expected: float) -> Array:
-        """Return `_step`, or what it was if no state of the two frames has changed since."""
+        """Return `_step`, kept from before if no state of the two frames has changed."""
         m = column.number
         states = self.frames[m].states, self.frames[k].states
         is_likely = column.forward >= column.forward.max() + JUMP_LOG
@@ -187,7 +191,8 @@ class Lattice:
     def _step(self, m: int, k: int, is_likely: Mask, most_expected: float) -> Array:
         """Return log odds (S before, S) of the steps from a key frame to another.
 
-        Nobody walks from a place that is far less likely (S before,) than the best.
+        Walks begin only at places that `is_likely` (S before,), as those far less likely than the best do not
+        matter.
         """
         starts, ends = self.frames[m].states, self.frames[k].states
         if moved := motion_between(self.frames, m, k):
@@ -218,7 +223,7 @@ class Lattice:
     def filter_path(self) -> Path:
         """Return the path of the last key frames, back to the newest from which frames are tracked.
 
-        The probabilities of a key frame are given the frames up to it, not later ones.
+        The probabilities of a key frame use the frames up to it, not later ones.
         """
         path = self._empty_path()
         for column, ended in zip(self.columns[::-1], self.ended[::-1], strict=False):
@@ -228,7 +233,7 @@ class Lattice:
         return path
 
     def smooth(self) -> Path:
-        """Return the probability of each state given all frames."""
+        """Return the probability of each state by all frames."""
         path = self._empty_path()
         backward = [np.zeros(len(column.emitted)) for column in self.columns]
         for n in range(len(self.columns) - 1, -1, -1):
@@ -261,7 +266,7 @@ class Lattice:
 def build_lattice(
     frames: Sequence[Frame], space: FreeSpace, motion: Motion, before: Lattice | None = None
 ) -> Lattice:
-    """Build the lattice of frames in their order; what has not changed since another is taken from it."""
+    """Build the lattice of frames in their order; columns that have not changed are taken from `before`."""
     lattice = Lattice(space, motion)
     if before is not None:
         lattice.known = before.known
@@ -279,11 +284,11 @@ class Ranked(NamedTuple):
 
     states: list[State]
     probabilities: Array  # (S,) that each is of the frame's place
-    expected: Pose | None = None  # where tracking surely puts a frame, but where it was not refined
+    expected: Pose | None = None  # pose that surely follows from tracking, but was not refined
 
     @property
     def is_sure(self) -> bool:
-        """True if the first pose more likely is right than not."""
+        """True if the first pose is more likely right than wrong."""
         return len(self.states) > 0 and self.states[0].is_refined and bool(self.probabilities[0] > EVEN)
 
     @property
@@ -296,7 +301,7 @@ class Ranked(NamedTuple):
         return self.confidence(demand.accuracy) >= demand.min_confidence
 
     def confidence(self, accuracy: Accuracy) -> float:
-        """Return the probability that the first pose is so exact; 0 if there is none."""
+        """Return the probability that the first pose is as exact as `accuracy`; 0 if there is no pose."""
         if not self.states:
             return 0.0
         return float(self.probabilities[0]) * accuracy.probability(self.states[0].gaussian)
@@ -306,7 +311,7 @@ NOTHING = Ranked([], np.empty(0))
 
 
 def believe(frames: Sequence[Frame], path: Path, k: int) -> Ranked:
-    """Return what a path says of a frame: a key frame's places, or where it was tracked to from one."""
+    """Return a frame's poses with their probabilities by a path: of a key frame, or by tracking."""
     frame = frames[k]
     if frame.is_key:
         return believe_key(frame.states, path.probabilities[k])
@@ -335,14 +340,14 @@ def believe_tracked(frames: Sequence[Frame], path: Path, k: int) -> Ranked:
     if ONE_ANSWER.holds(carried[0], own.pose):
         return Ranked([own, *states[1:]], probabilities)
     expected = carried[0] if probabilities[0] > EVEN else None
-    probabilities[0] = min(probabilities[0], EVEN)  # nothing was seen there
+    probabilities[0] = min(probabilities[0], EVEN)  # the photo was not compared with the scan there
     return Ranked(states, probabilities, expected)
 
 
 def probability_of_next(frames: Sequence[Frame], path: Path, k: int) -> float:
-    """Return the probability of the place of the next key frame, if it was tracked from a frame's own.
+    """Return the probability of the next key frame's place, if the frame `k` has the same key frame.
 
-    It is 1 if it was not, and 0.5 if there is a gap between the two.
+    It is 1 if the next key frame was tracked from another one, and 0.5 if there is a gap before it.
     """
     after = next((n for n in range(k + 1, len(frames)) if frames[n].is_key), None)
     if after is None or frames[after].key != frames[k].key:

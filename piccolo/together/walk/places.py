@@ -18,11 +18,11 @@ from .expectation import Place
 from .frames import MOST_ODDS, State
 from .path import COPY_LOG_ODDS
 
-MOST_PLACES = 64  # of a frame: the rooms of a hotel that look alike
+MOST_PLACES = 64  # of a frame: as many as a hotel has rooms that look alike
 
 
 def fits_mirror(problem: Problem, means: Means) -> bool:
-    """Return True if the mirrored photo has the better pose by brief searches."""
+    """Return True if, by brief searches, the photo fits better mirrored than as it is."""
     effort = means.effort.brief()
     own = score_briefly(problem, effort, means.workers)
     return score_mirror(problem, effort, means.workers) > own
@@ -51,10 +51,11 @@ def list_key_states(
 
 
 def most_elsewhere(problem: Problem, alone: Result, best: State, count: int) -> float:
-    """Return the odds [log] that a place may have at most where a frame that was searched was not found.
+    """Return the largest log odds of a place at which the search of a frame by itself found no pose.
 
-    If the photo is sure by itself, they are the lowest that one frame may give. All `count` places together
-    have those of a narrow photo that none of its poses is right: views alone tell little of it.
+    If the photo is sure by itself, they are the lowest that one frame may give. For a photo of a part of the
+    sphere, of which views alone show little, all `count` places together have the odds that none of the
+    photo's poses is right.
     """
     if alone.status == LOCALIZED:
         return best.log_odds - MOST_ODDS - COPY_LOG_ODDS
@@ -75,14 +76,14 @@ def narrow_down(problem: Problem, pose: Pose, radius: float, effort: Effort) -> 
 
 
 def find_places(problem: Problem, own: Pose, means: Means) -> list[Place]:
-    """Find the distinct poses, of the tilt of its own, that look like a photo beside that; best first."""
+    """Find the distinct poses that look like a photo, with the tilt of its pose `own`; best first."""
     close, effort = narrow_down(problem, own, math.inf, means.effort)
     ends = descend_briefly(close, effort, means.workers)
     return list_places(problem, ends, score_near(problem, own, means.workers))
 
 
 def list_places(problem: Problem, ends: Ends, own_score: float) -> list[Place]:
-    """List the distinct ends with their odds to a pose of a score."""
+    """List the distinct ends with their log odds against a pose with the score `own_score`."""
     R = ends.poses.R_cam_from_map
     centers = ends.poses.center_map
     kept = non_maximum_suppression(R, centers, MOST_PLACES, ONE_ANSWER)

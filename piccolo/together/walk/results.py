@@ -27,8 +27,8 @@ from .second_look import finish_path
 from .tracker import Tracker
 
 LEAST_WALKED = 2.0  # [m] between frames by which an odometry is checked
-LEAST_RATIOS = 4  # of distances; fewer say nothing
-TOLD_SCALE = 0.03  # error of an odometry's scale that is reported
+LEAST_RATIOS = 4  # ratios of distances by which an odometry is checked
+REPORTED_SCALE = 0.03  # error of an odometry's scale: a larger one is reported
 
 
 def make_localizations(tracker: Tracker, show: Progress = no_progress) -> list[tuple[Result, WalkFrame]]:
@@ -53,9 +53,9 @@ def make_localizations(tracker: Tracker, show: Progress = no_progress) -> list[t
 
 
 def check_odometry(frames: Sequence[Frame], found: Sequence[Result]) -> tuple[str, ...]:
-    """Return a warning if the sure frames say that the odometry is too long or too short.
+    """Return a warning if the odometry's distances are longer or shorter than those between sure frames.
 
-    Of the logarithms of ratios of distances the median counts, and their median deviation from it.
+    The median of the logarithms of the ratios must exceed what its own deviation, and a tolerance, allow.
     """
     pairs = [(f.odometry, r.best_pose) for f, r in zip(frames, found, strict=True) if r.status == LOCALIZED]
     sure = [(odometry, pose) for odometry, pose in pairs if odometry and pose]
@@ -70,7 +70,7 @@ def check_odometry(frames: Sequence[Frame], found: Sequence[Result]) -> tuple[st
         return ()
     middle = float(np.median(ratios))
     std = 1.4826 * float(np.median(np.abs(np.array(ratios) - middle))) / math.sqrt(len(ratios))
-    if abs(middle) < max(TOLD_SCALE, MOST_CONFLICT * std):
+    if abs(middle) < max(REPORTED_SCALE, MOST_CONFLICT * std):
         return ()
     percent = 100.0 * abs(math.expm1(middle))
     return (f"`odometry`: it is {percent:.0f} % too {'long' if middle > 0.0 else 'short'}",)
@@ -88,13 +88,13 @@ def make_localization(tracker: Tracker, frame: Frame, ranked: Ranked) -> Result:
     """Make a frame's result from its poses and the probabilities that the walk gives them."""
     if not ranked.states:
         found = frame.alone or nothing_found()
-        is_beyond = found.status == LOCALIZED  # reach of the others: it contradicts them
+        is_beyond = found.status == LOCALIZED  # it is beyond reach of the others, and contradicts them
         least = tracker.settings.min_confidence
         return found.take_belief(found.belief.scale(EVEN), least) if is_beyond else found
     best, *others = ranked.states
     others = others[:MAX_ALTERNATIVES]
     scan_map = tracker.scan_map
-    is_own = best.is_refined and best.end is None  # as only the search ends
+    is_own = best.is_refined and best.end is None  # then the pose is that of its own search
     own = frame.alone if is_own and frame.alone else nothing_found()
     contradicted = contradictions(scan_map, best.pose, tracker.settings.prior)
     within = tracker.settings.accuracy.probability(best.gaussian)
@@ -119,9 +119,9 @@ def smooth_positions(
 
     Minimizes sum (x_k - z_k)' C_k^-1 (x_k - z_k) + sum |a_k|^2 / s^2 over the positions x_k, where a_k is the
     second difference by time of three consecutive frames and s its deviation `max_acceleration` [m/s^2].
-    Rotations follow their positions by each frame's own covariance. Errors in common stay. Frames so far
-    apart in time that a camera at `max_speed` [m/s] can stop and turn back between them do not constrain each
-    other.
+    Rotations follow their positions by each frame's own covariance. Errors that all frames have in common are
+    not smoothed. Frames so far apart in time that a camera at `max_speed` [m/s] can stop and turn back
+    between them do not constrain each other.
     """
     from scipy.sparse import block_diag, eye, kron  # noqa: PLC0415  # only walks wait for it
     from scipy.sparse.linalg import splu  # noqa: PLC0415

@@ -1,7 +1,7 @@
 """A second look at the frames of a walk, when all of them are known.
 
-Likely places are refined, and frames are tracked where their path leads. Frames that are not sure are looked
-for near those that are, and some of them in the whole scan, each by itself.
+Likely places are refined, and frames are tracked at the places through which the path leads. Frames that are
+not sure are searched near frames that are, and some of them in the whole scan, each by itself.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,10 +28,10 @@ Find = Callable[[Problem], Followed | None]
 
 @one_blas_thread()
 def finish_path(tracker: Tracker, show: Progress) -> tuple[Path, list[Ranked]]:
-    """Find the path of all frames of a tracker, and what each may be.
+    """Find the path of all frames of a tracker, and the probable poses of each frame.
 
-    The likely places of key frames are refined, frames that were tracked elsewhere are tracked there, and
-    lost ones are looked for from sure ones.
+    The likely places of key frames are refined, frames that were tracked at another place than the path's are
+    tracked again, and lost frames are searched near sure ones.
     """
     path, beliefs = _settle(tracker, show)
     if _search_unsure(tracker, beliefs, show):
@@ -40,11 +40,11 @@ def finish_path(tracker: Tracker, show: Progress) -> tuple[Path, list[Ranked]]:
 
 
 def _settle(tracker: Tracker, show: Progress) -> tuple[Path, list[Ranked]]:
-    """Refine and track frames where their path leads; return it, and what each frame may be."""
+    """Refine and track frames where the path leads; return the path, and the probable poses of each frame."""
     num = len(tracker.frames)
     path = _refine_likely(tracker, show)
     beliefs = [believe(tracker.frames, path, k) for k in range(num)]
-    both_ways = [*range(num)[::-1], *range(num)]  # what confirms a frame may do so for the next
+    both_ways = [*range(num)[::-1], *range(num)]  # a frame that is confirmed may confirm the next
     asked: dict[int, list[Pose]] = {}
     for k in show(iter(both_ways), len(both_ways), "look for lost frames"):
         near = [beliefs[m].states[0].pose for side in _list_sure(tracker.frames, beliefs, k) for m in side]
@@ -56,10 +56,10 @@ def _settle(tracker: Tracker, show: Progress) -> tuple[Path, list[Ranked]]:
 
 
 def _search_unsure(tracker: Tracker, beliefs: Sequence[Ranked], show: Progress) -> bool:
-    """Search frames by themselves that the walk leaves unsure; return True if that finds any.
+    """Search the frames that the walk leaves unsure, each by itself; return True if any is found.
 
-    A pose beyond reach of sure frames does not count. A frame that was found stays as it is, unless the photo
-    is sure by itself.
+    A pose beyond reach of sure frames does not count. A frame that had a pose keeps it, unless the photo is
+    sure of the new one by itself.
     """
     asked = list_unsure(tracker.frames, beliefs, tracker.settings.demand)
     is_any_found = False
@@ -81,8 +81,8 @@ def _search_unsure(tracker: Tracker, beliefs: Sequence[Ranked], show: Progress) 
 def list_unsure(frames: Sequence[Frame], beliefs: Sequence[Ranked], demand: Demand) -> list[int]:
     """List frames that are not localized, and were not searched by themselves.
 
-    Of each run of such frames some are listed, evenly spread: what one of them finds, the others are found
-    from.
+    Of each run of such frames only some are listed, evenly spread: from each that is found, the frames around
+    it are tracked.
     """
     is_unsure = [
         frame.alone is None and not belief.is_enough(demand)
@@ -110,12 +110,12 @@ def _refine_likely(tracker: Tracker, show: Progress) -> Path:
 
 
 def _list_rough(tracker: Tracker, path: Path, k: int) -> list[int]:
-    """List the rough states of a frame that are likely, or that together may leave the best unsure."""
+    """List the rough states of a frame that are likely, or that together may make the best unsure."""
     found = path.probabilities[k]
     states = tracker.frames[k].states if len(found) else []
     rough = sorted((j for j, state in enumerate(states) if not state.is_refined), key=lambda j: -found[j])
-    left = np.cumsum(found[rough][::-1])[::-1]  # with those that are less likely
-    limit = 1.0 - MIN_CONFIDENCE  # with less in all, the best stays sure
+    left = np.cumsum(found[rough][::-1])[::-1]  # of each state and all that are less likely
+    limit = 1.0 - MIN_CONFIDENCE  # if all the rest have less, the best stays sure
     return [
         j
         for j, total in zip(rough, left, strict=True)
@@ -135,7 +135,7 @@ def _refine(tracker: Tracker, path: Path, k: int) -> None:
 
 
 def _find_lost(tracker: Tracker, path: Path, beliefs: list[Ranked], k: int) -> None:
-    """Track a frame that is not sure from where it is to be expected, or look for it near sure ones."""
+    """Track a frame that is not sure from where it is expected, or search it near sure ones."""
     frames = tracker.frames
     accuracy = tracker.settings.accuracy
     ways = _list_ways(tracker, beliefs, k)
@@ -191,7 +191,7 @@ def _list_sure(frames: Sequence[Frame], beliefs: Sequence[Ranked], k: int) -> li
 
 
 def _hang(frames: list[Frame], path: Path, k: int, sure: int, found: Followed) -> None:
-    """Give a frame a pose beside a sure one, whose key frame is then its key frame too."""
+    """Give a frame the pose that was found from a sure frame, whose key frame is then its key frame too."""
     key = sure if frames[sure].is_key else frames[sure].key
     chosen = None if key is None else path.choose(key)
     if key is None or chosen is None:

@@ -28,8 +28,8 @@ from .places import fits_mirror, list_key_states
 
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
 MOST_KNOWN = 2  # chosen: poses of a frame within reach, at which it is looked for again
-NUM_KEPT = 4  # problems, of the frames that were asked for last
-BETWEEN_KEYS = ONE_PLACE.distance  # [m] key frames are so far apart
+NUM_KEPT = 4  # frames whose problems are kept: those used last
+BETWEEN_KEYS = ONE_PLACE.distance  # [m] between key frames, at least
 ELSEWHERE = ONE_PLACE.distance + 2.0 * REACH_SLACK  # [m] reach beyond which a camera may be at another place
 
 
@@ -44,11 +44,11 @@ class Tracker:
         self.workers = workers
         self.motion: Motion = motion
         self.lattice: Lattice = Lattice(FreeSpace(scan_map.octree, scan_map.centers, workers), motion)
-        self.read: Read = lambda k: None  # until somebody keeps the pictures
+        self.read: Read = lambda k: None  # `api.scan_walk.Walk` puts its own here
         self.means = Means(settings.effort, workers, Stopwatch())
         self.problems: dict[int, Problem] = {}  # by the number of the frame
-        self.found_at: float = -math.inf  # time when it was last found; before that, of the first search
-        self.next_search: float = 0.0  # [m] reach since then at which all places are searched again
+        self.found_at: float = -math.inf  # time when the camera was last found; before, of the first search
+        self.next_search: float = 0.0  # [m] reach since `found_at` at which all places are searched again
 
     @property
     def frames(self) -> list[Frame]:
@@ -69,7 +69,7 @@ class Tracker:
 
     @one_blas_thread()
     def add(self, panorama: Panorama, problem: Problem, time: float, odometry: Pose | None = None) -> Frame:
-        """Localize the next frame, whose problem is prepared; the first waits until free space is known."""
+        """Localize the next frame, whose problem is prepared; the first call computes the free space."""
         frame = Frame(time, odometry=odometry)
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
             self._keep(len(self.frames), problem)
@@ -114,10 +114,10 @@ class Tracker:
         return begin is None or frame.arrived is None or frame.arrived.distance(begin) >= BETWEEN_KEYS
 
     def _is_doubtful(self, problem: Problem, frame: Frame) -> bool:
-        """Return True if the place is doubtful from which a frame was found that shows more of it.
+        """Return True if the place from which a frame was tracked is doubtful, and the frame shows more.
 
-        A photo of a part of the sphere shows more if it looks elsewhere than the key frames nearby: then it
-        is other evidence.
+        A photo of a part of the sphere shows more if it looks in another direction than the key frames
+        nearby: then it is further evidence.
         """
         key = self._last_key()
         if key is None or not problem.profile.is_partial or not self._shows_more(problem, frame):
@@ -126,7 +126,7 @@ class Tracker:
         return bool(likeliest < self.settings.min_confidence)
 
     def _shows_more(self, problem: Problem, frame: Frame) -> bool:
-        """Return True if a frame has turned by half of what it shows since all key frames nearby."""
+        """Return True if a frame is turned by half of its field of view against all key frames nearby."""
         cone = find_cone(problem.photo.image(problem.profile.first.image), margin=0.0)
         k = frame.key
         while k is not None and frame.arrived and (pose := self.frames[k].tracking_pose):
@@ -170,7 +170,7 @@ class Tracker:
         return find_near(problem, expected, self.means, KnownPoses(known[:MOST_KNOWN], of_others))
 
     def _gaussian_at(self, k: int, pose: Pose) -> PoseGaussian | None:
-        """Return a frame's pose with its covariance, if it is at a pose."""
+        """Return frame k's pose with its covariance if that pose is `pose`; else None."""
         gaussian = self.frames[k].states[0].gaussian
         return gaussian if gaussian and RIGHT.holds(gaussian.pose, pose) else None
 
@@ -198,9 +198,9 @@ class Tracker:
         return next((k for k in numbers if self.frames[k].departed is not None), None)
 
     def search(self, problem: Problem, frame: Frame) -> None:
-        """Search the whole scan for a frame, which then is a key frame, if anything is found.
+        """Search the whole scan for a frame, which becomes a key frame if anything is found.
 
-        If the photo is not sure by itself, the poses to which it was tracked stay.
+        If the photo is not sure by itself, its poses by tracking are kept.
         """
         frame.alone = localize(self.scan_map, problem.source, self.settings, self.means)
         is_sure = frame.is_localized_alone
@@ -213,9 +213,9 @@ class Tracker:
             frame.is_key = True
 
     def _depart(self, problem: Problem, frame: Frame) -> None:
-        """Refine the likeliest place of a key frame: if it is likely, the next frames are tracked from it.
+        """Refine the likeliest place of a key frame; if it is likely, the next frames are tracked from it.
 
-        Of places about as likely, as copies are, it is the one that looks best.
+        Of several about equally likely places, as copies are, the one that looks best is taken.
         """
         while True:
             probabilities = self.lattice.filter_path().probabilities[-1]
