@@ -62,7 +62,7 @@ class Answering:
         """
         answered: dict[int, Answer] = {}
 
-        def ask(looks: Sequence[Look]) -> Iterator[Result]:
+        def make_looks(looks: Sequence[Look]) -> Iterator[Result]:
             if interruption.number:
                 return
             tasks = (self.localizer.task(Path(look.pano))._replace(look=look) for look in looks)
@@ -74,5 +74,5 @@ class Answering:
                     answered[look.number] = answer
                 yield answer.result
 
-        for change in revise(results, ask, self.localizer.settings.min_confidence):
+        for change in revise(results, make_looks, self.localizer.settings.min_confidence):
             yield change, answered.pop(change.number, Answer(change.after, change.after.warnings))

@@ -32,14 +32,14 @@ from .localizer import Localizer, rename
 from .results_file import WAYS, Records
 
 NUM_TRIED = 3  # first frames: a walk is refused if one reason prevents reading all of them and the last
-WriteSteps = Callable[[str, Sequence[Step]], object]  # of the search of a photo, by its name
+WriteSteps = Callable[[str, Sequence[Step]], object]  # writes the steps of the search of a photo, by its name
 
 
 class Job(NamedTuple):
     """Photos to be localized together."""
 
-    what: str  # the photos, in words
-    photos: Mapping[str, Photo]  # by their names in the results
+    what: str  # the kind of photos, in words for messages
+    photos: Mapping[str, Photo]  # the photos by their names in the results
     fields: Callable[[Path], Mapping[str, Any]]  # fields of a photo's line that say how it was made
     run: Callable[[Journal], list[Result] | Interruption]
     output: Path | None = None  # further file that is written beside the results

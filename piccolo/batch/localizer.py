@@ -86,14 +86,14 @@ class Answer(NamedTuple):
     warnings: tuple[str, ...] = ()  # those of the photo, without those of the scan
     overlay: bytes | None = None  # PNG
     occlusion_mask: bytes | None = None  # PNG
-    steps: tuple[Step, ...] = ()  # of the search
+    steps: tuple[Step, ...] = ()  # steps of the search, if they are traced
 
 
 @dataclass(frozen=True)
 class Localizer:
     """A scan and the options for its photos, which answer tasks; pickled for other processes."""
 
-    paths: tuple[Path, ...]  # of the scan
+    paths: tuple[Path, ...]  # paths of the scan's files
     settings: Settings  # with which the scan is prepared
     cloud_settings: CloudSettings
     photo: Photo  # the options that all photos share; it has no picture

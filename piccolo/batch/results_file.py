@@ -69,7 +69,7 @@ def _by_option(settings: Mapping[str, Any]) -> dict[str, Any]:
 def _say(name: str, value: Any, given: str = "") -> str:
     """Describe the value of an option, such as "`focal_px` 1585" or "without `focal_px`"."""
     if isinstance(value, dict):
-        value = value.get("path", True)  # of a calibration
+        value = value.get("path", True)  # the file of a calibration
     if value in (None, False, []):
         return f"without {name}"
     if value is True:
@@ -241,7 +241,8 @@ class FileOutput:
     def finish(self, keeps_others: bool) -> int:
         """Put the lines of the panoramas into their order, and drop the lines that were replaced.
 
-        Lines of panoramas that were not named are kept before all others, or dropped; returns how many were dropped.
+        Lines of panoramas that were not named are kept before all others, or dropped. Returns how many were
+        dropped.
         """
         others = self._records.list_unnamed()
         kept = sorted(line.span for line in others) if keeps_others else []

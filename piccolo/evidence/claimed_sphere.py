@@ -27,7 +27,7 @@ from .self_calibration import Freedom, FreeEnd, LensEstimate, descend_freely, in
 NO_CORRECTION = np.zeros(3)
 CLAIM = Claim(
     NO_CORRECTION,
-    deviations=np.array([0.005, 0.005, math.radians(0.3)]),  # chosen: of what stitched panoramas claim
+    deviations=np.array([0.005, 0.005, math.radians(0.3)]),  # chosen: errors of claims of stitched panoramas
     wrong_deviations=np.array([0.05, 0.1, 0.1]),  # chosen
     wrong_shares=np.array([0.005, 0.005, 0.005]),  # chosen
 )
@@ -50,7 +50,7 @@ class SphereFit(NamedTuple):
     camera: Camera  # as found, or as claimed
     estimate: LensEstimate  # corrections of this camera by the photo and the scan alone
     is_claimed: bool  # the camera is as the picture claims
-    conflict: float = 0.0  # deviations between claim and picture, where what is claimed is used
+    conflict: float = 0.0  # deviations between claim and picture, if the claim is used
     doubt: float = 0.0  # probability that the claim is wrong and has pulled the pose along
 
     @property
@@ -71,7 +71,7 @@ class SphereFit(NamedTuple):
         return np.asarray(motion @ (covariance + beyond * np.outer(off, off)) @ motion.T)
 
     def describe(self) -> SphereGeometry:
-        """Return what the panorama shows of the sphere."""
+        """Return the part of the sphere that the panorama shows."""
         across, down = self.camera.focal
         width, height, horizon = np.sqrt(np.diag(self.covariance))
         shown = self.camera.width / across, self.camera.height / down

@@ -9,7 +9,7 @@ from ..problem.prior import heading_errors
 from ..scan_map.camera_positions import heights_above_floor
 from ..scan_map.scan_map import ScanMap, find_scan_at
 
-STEEP = 0.2  # cosine of an elevation: what looks up or down more steeply has no heading
+STEEP = 0.2  # cosine of an elevation: a camera that looks up or down more steeply has no heading
 
 
 def contradictions(scan_map: ScanMap, pose: Pose, prior: Prior) -> tuple[Contradiction, ...]:

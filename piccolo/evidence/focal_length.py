@@ -49,7 +49,7 @@ from .self_calibration import (
 )
 from .verification import draw_near
 
-K1_DEVIATION = 0.05  # of k1 where the camera is a guess
+K1_DEVIATION = 0.05  # prior deviation of k1, if the camera is a guess
 FITTED = [FOCAL, LENS.index("radial")]  # corrections that are applied; the others widen the covariance
 # deviations of the other corrections: of a calibration, and of a focal length alone
 CALIBRATED = (0.002, 0.003, 0.003, 0.005)
@@ -227,7 +227,7 @@ def fits_radial(prior: FocalPrior, camera: Camera) -> bool:
 
 
 def make_claim(prior: FocalPrior, camera: Camera) -> Claim:
-    """Return what a photo with a focal length claims, by its calibration or without one."""
+    """Return the claim about a camera with a prior focal length, calibrated or not."""
     names = MODELS[camera.model][1]
     expected = np.zeros(len(OTHERS_WRONG) + 1)
     expected[FOCAL] = math.log(prior.focal / camera.focal[0])

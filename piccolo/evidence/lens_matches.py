@@ -19,7 +19,8 @@ from .self_calibration import LensEstimate, invert
 from .verification import LEAST_ERROR
 
 MOST_LENS_CHANGE = np.array([0.5, 0.2, 0.3, 0.3, 0.6])  # corrections that are searched
-MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
+# scale of the matches' loss in each step
+MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)
 AGREES = 0.25  # least weight of a match that agrees
 MATCHED_DEVIATION = 0.015  # of errors that all matches share, of the logarithm of a focal length by matches
 INFLATION = 4.0  # of the covariance by matches, so that 95 % of true focal lengths lie within two deviations
@@ -31,7 +32,7 @@ class MatchFit(NamedTuple):
 
     values: Array  # (5,) of LENS
     information: float  # of the focal length's logarithm; 0 if few matches agree
-    pose: Pose  # in the map, with them
+    pose: Pose  # in the map, fitted together with the corrections
 
 
 def add_matches(estimate: LensEstimate, by_matches: MatchFit) -> LensEstimate:

@@ -34,7 +34,7 @@ OCCLUSION_STATS_WIDTH = 64  # [px] of local means
 SIGMA_DEG = 15.0  # of the Gaussian for contrast
 AGREEMENT_WIDTH = 96  # [px] of the agreement, cells of 3.75 degrees
 NUM_STATISTICS_ROUNDS = 3  # of statistics over the cells that agree
-FLAT_VARIANCE = np.float32(0.08**2)  # of a channel in [0, 1]: where it is less, a difference counts less
+FLAT_VARIANCE = np.float32(0.08**2)  # of a channel in [0, 1]: where it varies less, a difference counts less
 CONTRADICTING = 0.8  # squared deviations, summed over channels; also the scale of Geman and McClure's weights
 CELL_AROUND = np.ones((3, 3), np.uint8)  # of a cell: an edge may be displaced by one
 EXPLAINED = 0  # levels of the mask
@@ -167,7 +167,7 @@ class Agreement:
     """Agreement of cloud and panorama at a pose, on cells of the sphere."""
 
     correlation: float  # of locally normalised colours over what both show
-    seen_fraction: float  # of the sphere, what both show
+    seen_fraction: float  # fraction of the sphere that both show
 
     @property
     def value(self) -> float:

@@ -53,7 +53,7 @@ class Belief:
 
 
 def make_belief(places: Sequence[float] | Array, within: float = 1.0, doubt: float = 0.0) -> Belief:
-    """Return a belief in places (K,), of which none is right with the rest of the probability."""
+    """Return a belief in places (K,) with these probabilities; that none is right has the rest."""
     return Belief(tuple(_complete(np.asarray(places, np.float64)).tolist()), within, doubt)
 
 

@@ -22,7 +22,7 @@ def local_share(odds: float) -> float:
 
 
 class Shares(NamedTuple):
-    """Probabilities of a photo in a bundle: where the others put it, and what its own pose is worth there."""
+    """Probabilities that a photo belongs where others put it, and that its own pose is right there."""
 
     right: float  # it belongs there, and its own pose is right
     missed: float  # it belongs there, and its own pose is missing or a local optimum near the right one

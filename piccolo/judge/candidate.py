@@ -73,8 +73,8 @@ class Candidate:
     """A pose that may be right, with the evidence that was computed for it so far."""
 
     pose: Pose  # in the map
-    score: float  # of the comparison
-    comparison: Comparison  # of the photo with the scan as seen from the pose
+    score: float  # score of `comparison`
+    comparison: Comparison  # of the photo and the scan as seen from the pose
     against_prior: tuple[Contradiction, ...] = ()  # prior knowledge that the pose contradicts
     num_matches: int | None = None  # features that agree with the drawn scan; None: it was not drawn
     edge_score: float | None = None  # of the scan's edges drawn at the pose, in a scan without colours

@@ -28,7 +28,7 @@ TELLING_STD = 0.03  # [m] deviation of the position by the focal length: a large
 
 
 def conclude(frame: MapFrame, case: Case, belief: Belief, min_confidence: float) -> Result:
-    """Return the result in the world for a case and a belief, with what rules the pose out."""
+    """Return the result in the world for a case and a belief, with the reasons that rule the pose out."""
     measured = case.measured
     geometry = case.geometry
     warnings = list(map(explain, measured.contradicted))

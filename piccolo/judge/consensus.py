@@ -12,10 +12,10 @@ WRONG_SHARE = 0.02  # chosen: share of given focal lengths that are wrong
 WRONG_DEVIATION = 0.1  # chosen: deviation of the logarithm of a wrong one
 MOST_LOG = 20.0  # logarithm of odds, at most
 MOST_CONFLICT = 4.0  # deviations between an estimate and the given focal length: more contradict it
-LEAST_AGREEING_PHOTOS = 3  # that make a consensus
+LEAST_AGREEING_PHOTOS = 3  # photos that make a consensus
 OUTLYING = 3.0  # deviations, the scale of weights: photos that differ by more weigh less than a quarter
 SHARED_DEVIATION = 0.003  # of an error that all photos of a camera share, as that of a calibration
-NUM_UPDATES = 20  # of the weights
+NUM_UPDATES = 20  # rounds in which the photos' weights are computed again
 
 
 class Opinion(NamedTuple):

@@ -1,4 +1,4 @@
-"""Reasons that rule out a pose, whatever its probability is, and their words."""
+"""Reasons that rule out a pose, whatever its probability is, and the warnings that explain them."""
 
 from collections.abc import Mapping
 from enum import StrEnum

@@ -17,10 +17,10 @@ class Evidence:
     # lead over the best pose elsewhere, as a share of the area that this pose explains, over what both views
     # show; 1 if there is no pose elsewhere; of preset paper, score less that of the best pose elsewhere
     margin: float
-    agreement: float  # correlation over what both show, charged where that is under half of the sphere
-    explained_fraction: float  # of what the panorama shows, by solid angle, see Occlusion
-    seen_fraction: float  # of the sphere, on which both show anything
-    contradicted_fraction: float = 0.0  # of what the panorama shows; what is left was not scanned
+    agreement: float  # correlation over what both show, reduced if that is less than half of the sphere
+    explained_fraction: float  # of the area that the panorama shows, by solid angle (see Occlusion)
+    seen_fraction: float  # fraction of the sphere where panorama and scan both show something
+    contradicted_fraction: float = 0.0  # of the area that the panorama shows; the rest of it was not scanned
     num_matches: int | None = None  # local features of the photo that agree with the pose; None: not counted
     alternative_matches: int | None = None  # the most that agree with a pose elsewhere
 
@@ -30,7 +30,7 @@ class Alternative:
     """Another pose of a photo, at another place, in world coordinates."""
 
     pose: Pose
-    score: float  # as of Evidence
+    score: float  # as in Evidence
     num_matches: int | None = None  # local features that agree with it
     probability: float = 0.0  # that it is right
     scan: str | None = None  # name of the scan in which it lies, of a map that names its scans
@@ -95,8 +95,8 @@ class SphereGeometry:
 class Source:
     """The scan and the photo of a result; None where that is not known."""
 
-    cloud_sha256: str | None = None  # of the scan's file; of several, of their sorted digests, one a line
-    pano_sha256: str | None = None  # of the photo's file; of cube faces, of their digests in order
+    cloud_sha256: str | None = None  # of the scan's file; if several, of their sorted digests, one a line
+    pano_sha256: str | None = None  # of the photo's file; if cube faces, of their digests in order
     image_size: tuple[int, int] | None = None  # width and height of the picture as it is stored [px]
     capture_time: str | None = None  # by EXIF, ISO 8601, with the offset from UTC if EXIF has it
 

@@ -31,8 +31,8 @@ from .means import Means
 from .search import search_poses
 
 FIRST_BEAM = Beam(100, 12, 4, 1)
-FIRST_ROTATIONS = 1000  # of SO(3)
-FEW_CELLS = 200  # of the grid; if a prior leaves fewer, all of them are searched
+FIRST_ROTATIONS = 1000  # rotations of a brief search with any tilt
+FEW_CELLS = 200  # cells of the grid: if a prior leaves fewer, all of them are searched
 PLACES_AT_ONCE = 32  # places at which the scan is drawn before poses are proposed
 COS_TILT = math.cos(math.radians(12.0))  # of the largest angle between a proposed pose's tilt and a known one
 
@@ -196,7 +196,7 @@ def search_and_refine(problem: Problem, tilts: Tilts, beam: Beam, means: Means) 
 
 
 def add_verified(problem: Problem, candidates: list[Candidate], workers: Workers) -> list[Candidate]:
-    """Verify candidates, if the profile says so; add poses refined on many matches."""
+    """Verify candidates by matches, if the profile wants it; add poses refined on many matches."""
     if not problem.profile.refines_on_matches or not candidates:
         return candidates
 

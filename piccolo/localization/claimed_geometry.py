@@ -1,4 +1,4 @@
-"""The geometry that a photo claims, compared with the scan, and its poses refined with what was found."""
+"""The geometry that a photo claims is compared with the scan; the poses are refined with the one found."""
 
 import math
 import operator
@@ -37,7 +37,7 @@ MIN_CALIBRATED_SCORE_LEFT = 0.95  # fraction of the score that a pose must keep 
 MAX_CALIBRATIONS = 4  # fits of a focal length
 SUSPECT = 0.8  # deviations between claim and picture, from which other geometries are searched
 CONTRADICTED_DEVIATIONS = 3.0  # between claim and picture, from which another geometry may replace the claim
-MIN_RETAKE_GAIN = 1.1  # times the score with the claim: what another geometry must reach
+MIN_RETAKE_GAIN = 1.1  # least score with another geometry, as a multiple of the score with the claim
 MOST_ROUNDS = 3
 CHECK_LIMITS = Limits(1.0, 8, 1e-3)
 FULL_LIMITS = Limits(0.7, 15, 1e-4)  # on points, where the claim does not hold

@@ -15,8 +15,8 @@ from ..system.jobs.threads import Workers
 from ..system.kernels.jit import F0, F1, kernel
 
 EXACT = (1 << 24) - 1  # whole numbers up to this are exact in float32
-MOST_LEVEL = 127.5  # of a channel
-MOST_ENERGY = 3.0 * MOST_LEVEL**2  # of a cell
+MOST_LEVEL = 127.5  # largest value of a channel
+MOST_ENERGY = 3.0 * MOST_LEVEL**2  # largest sum of squared channels of a cell
 VIEWS_A_PRODUCT = 512  # views a matrix product, at most
 LEAST_SEEN = 0.3  # fraction of what a photo shows that a view must see to be compared with it
 ALL_SEEN = np.float32(255.0)  # the number that stands for a view's cell that is seen wholly

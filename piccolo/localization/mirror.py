@@ -40,7 +40,7 @@ def find_mirrored(problem: Problem, best: Candidate, effort: Effort, workers: Wo
 def is_explained(method: Method, best: Candidate) -> bool:
     """Return True if a pose explains a photo so well that it is not mirrored.
 
-    A score alone does not tell: a thin wall seen from behind explains much of a mirrored photo of its front.
+    A score alone is not enough: a thin wall seen from behind explains much of a mirrored photo of its front.
     """
     return best.score >= method.enough_explained and (best.num_matches or 0) >= method.enough_matches
 

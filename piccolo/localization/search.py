@@ -27,7 +27,7 @@ SCORES_AT_ONCE = 1 << 23  # 32 MB
 LOWEST = np.float32(-np.inf)
 TURNED_BYTES = 4 * 16  # a cell and rotation: channels, validity, energy, and the arrays they are made from
 MIN_STARTS = 1000
-PITCHES_DEG = (-27.0, -18.0, -9.0, 0.0, 9.0, 18.0, 27.0)  # of a camera held about level
+PITCHES_DEG = (-27.0, -18.0, -9.0, 0.0, 9.0, 18.0, 27.0)  # tilts of a camera that is held about level
 NUM_LEVEL_YAWS = 40
 
 

@@ -26,11 +26,11 @@ NUM_TILTS = 3  # tilts that are searched in full, at most
 # poses of panoramas of three photorealistic buildings (at most 0.42) and those in racks and hotel rooms that
 # were made by a program (0.54 to 0.84)
 LEAST_ALIKE = 0.5
-LEVEL_SINE = np.sin(np.radians(20.0))  # of the angle of level lines to the horizon, at most
+LEVEL_SINE = np.sin(np.radians(20.0))  # of the largest angle to the horizon of lines that count as level
 
 
 def is_tilt_known(problem: Problem) -> bool:
-    """Return True if the settings, or the photo, say how the camera was tilted."""
+    """Return True if the camera's tilt is known, from the settings or from the photo's file."""
     gravity = problem.gravity
     return gravity == "known" or (problem.source.gpano is not None and gravity != "unknown")
 

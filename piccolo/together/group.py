@@ -309,7 +309,7 @@ def judge_group(
         is_sure = member.alone.status == LOCALIZED
         of_others = expected.get(number)
         if is_sure and of_others and number in own and own[number].square_distance(of_others) > LIKELY:
-            of_others = None  # few matches contradict what is sure
+            of_others = None  # a pose by few matches does not count against a sure one
         placed = place_between(belongs, own.get(number), of_others)
         is_refused = bool(member.alone.belief.ruled_out) and not member.is_misplaced
         is_own = member.is_best(support.own.pose) and placed.shares.right >= placed.shares.missed

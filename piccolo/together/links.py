@@ -42,8 +42,8 @@ class Trust(NamedTuple):
     reach: float  # [m] from the nearest photo with which it is matched, at most
 
 
-FIRM = Trust(12, math.inf)  # of repeated patterns, as ceilings have, 8 matches agree by chance
-WEAK = Trust(6, 1.0)  # of photos that are taken at one spot
+FIRM = Trust(12, math.inf)  # for any photos: in repeated patterns, as of ceilings, 8 matches agree by chance
+WEAK = Trust(6, 1.0)  # for photos that were taken at one spot
 
 
 class Placed(NamedTuple):

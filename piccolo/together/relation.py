@@ -20,7 +20,7 @@ from ..system.arrays import Array
 NUM_WEAK = 2  # directions in which further descents begin
 TRIED = (0.15, 0.3)  # [m] distances of their starts, on both sides of the pose
 RANGE_OF_TURN = 3.0  # chosen: [m] times a turn [rad] is the move to which the turn is compared
-STEPS_OF_RELATION = 30  # of a descent
+STEPS_OF_RELATION = 30  # steps of a descent
 LEAST_MOVE = 0.05  # part of a unit direction that moves the camera: with less, it is hardly more than a turn
 
 

@@ -76,27 +76,27 @@ def localize_in_order(
             num_yielded += 1
             yield results[-1]
 
-    def ask(looks: Sequence[Look]) -> Iterator[Result]:
+    def make_looks(looks: Sequence[Look]) -> Iterator[Result]:
         return (look_again(photos[look.number], look) for look in looks)
 
-    for _ in revise(results, ask, min_confidence):
+    for _ in revise(results, make_looks, min_confidence):
         pass
     yield from results[num_yielded:]
 
 
 def revise(
-    results: list[Result], ask: Callable[[Sequence[Look]], Iterable[Result]], min_confidence: float
+    results: list[Result], make_looks: Callable[[Sequence[Look]], Iterable[Result]], min_confidence: float
 ) -> Iterator[Change]:
     """Localize photos again by the evidence of others, replace their results in the list; yield each change.
 
-    `ask` returns the results of looks in their order. A result with an error changes nothing. If `ask`
-    returns fewer results, as the work was interrupted, no more looks are made.
+    `make_looks` returns the results of looks in their order. A result with an error changes nothing. If it
+    returns fewer results, as the work was interrupted, no more looks follow.
     """
     for list_looks in LISTINGS:
         yield from follow_cameras(results, min_confidence)
         looks = list_looks(results)
         num_answers = 0
-        for num_answers, after in enumerate(ask(looks), 1):
+        for num_answers, after in enumerate(make_looks(looks), 1):
             look = looks[num_answers - 1]
             if after.error is None:
                 is_news = look.first is None or names_of(after) not in ((), names_of(look.first))

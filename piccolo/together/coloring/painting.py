@@ -33,7 +33,7 @@ from .alignment import Anchor, Sight, align, look, weigh_points
 from .passersby import remove_passersby
 
 LEAST_COLORING_PHOTOS = 2
-NUM_COLORING_ROUNDS = 2  # in which photos are localized by the colours of the round before
+NUM_COLORING_ROUNDS = 2  # rounds, each of which localizes photos by the colours of the round before
 MOST_FOLDS = 8  # groups of photos; each is localized in a map that has no paint of the group's own photos
 PIXEL_BYTES = 8  # a pixel of a photo that gives colours: RGB, whether it counts, and both packed
 PHOTO_BYTES = 40e6  # further, a photo: its smaller copy, ranges around it, and its share of aligned points
@@ -181,7 +181,7 @@ class Coloring:
     """A scan that was coloured by photos, and the photos in it."""
 
     results: list[Result]  # one of each photo, in order
-    num_points: int  # of the scan that was written; 0 if none was, as fewer than two photos are localized
+    num_points: int  # points written; 0 if no scan was, as fewer than two photos are localized
     num_colored: int  # those of these points that at least one photo sees
 
 

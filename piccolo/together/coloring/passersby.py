@@ -1,4 +1,4 @@
-"""People and what else moved between photos: parts of them that the others contradict give no colours.
+"""People and things that moved between photos: parts of a photo that others contradict give no colours.
 
 If three or more photos show a point, those that differ from most of them are outvoted. If two photos show it
 and differ, at first both are blamed, then each as far as it is outvoted around the point. Blame and agreement
@@ -30,7 +30,7 @@ MOST_APART = 40.0  # [8-bit levels] in any channel, between photos that agree
 ALIKE = np.float32(30.0)  # [8-bit levels] deviation of colours over which votes spread
 VOTE_DEVIATION = np.float32(5.0)  # [cells] deviation of distances over which votes spread
 VOTE_REACH = 12  # [cells] at most
-FEW_VOTES = 1.0  # agreeing votes that every cell has: one contradiction alone says little
+FEW_VOTES = 1.0  # agreeing votes that every cell has from the start, as one contradiction alone proves little
 MOST_BLAME = 0.5  # share of votes from which a cell gives no colours
 FIRST_BLAME = 0.1  # of either of two photos that differ, before votes are counted
 NUM_BLAME_ROUNDS = 3  # in which blame is divided between two photos

@@ -29,7 +29,7 @@ How = Literal["alone", "near", "tracked", "none"]
 MOST_EXPECTED = 3.0  # [log] that a frame gains at most by being where it was expected
 MOST_ODDS = 8.0  # [log] that one frame may add: errors outside the model allow no more certainty
 MAX_ACCELERATION = 2.0  # [m/s^2]
-REACH_SLACK = COARSE_SPACING / 2.0  # [m] beyond what a person walks: places are as rough as their grid
+REACH_SLACK = COARSE_SPACING / 2.0  # [m] added to the distance walked: places are as rough as their grid
 JUMP_LOG = -9.0  # log odds of a jump to any place: lift, cut, pocket, a place that was not scanned
 
 

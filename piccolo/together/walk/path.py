@@ -44,7 +44,7 @@ class Path(NamedTuple):
         return int(found.argmax()) if found.sum() > EVEN else None
 
 
-# what steps depend on: the states of two frames, those that are walked from; and the log odds of the steps
+# the values on which steps depend (states of two frames, which of them a walk may begin at), and the steps
 _Known = tuple[list[State], list[State], bytes, Array]
 
 

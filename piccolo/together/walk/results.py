@@ -55,7 +55,7 @@ def make_localizations(tracker: Tracker, show: Progress = no_progress) -> list[t
 def check_odometry(frames: Sequence[Frame], found: Sequence[Result]) -> tuple[str, ...]:
     """Return a warning if the odometry's distances are longer or shorter than those between sure frames.
 
-    The median of the logarithms of the ratios must exceed what its own deviation, and a tolerance, allow.
+    The median of the logarithms of the ratios is compared with its deviation and with REPORTED_SCALE.
     """
     pairs = [(f.odometry, r.best_pose) for f, r in zip(frames, found, strict=True) if r.status == LOCALIZED]
     sure = [(odometry, pose) for odometry, pose in pairs if odometry and pose]
@@ -150,7 +150,7 @@ def acceleration_rows(times: Sequence[float], max_acceleration: float, max_speed
     before, after = steps[:-1], steps[1:]
     factors = np.array([1.0 / before, -1.0 / before - 1.0 / after, 1.0 / after])
     factors *= 2.0 / (before + after) / max_acceleration
-    # in a longer time a person can stop and walk back
+    # in a longer time than this, a person can stop and walk back
     factors[:, np.maximum(before, after) > 2.0 * max_speed / max_acceleration] = 0.0
     row, offset = np.indices((len(before), 3))
     return csr_matrix((factors.T.ravel(), (row.ravel(), (row + offset).ravel())), (len(before), len(times)))

@@ -27,7 +27,7 @@ from .path import EVEN, Lattice
 from .places import fits_mirror, list_key_states
 
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
-MOST_KNOWN = 2  # chosen: poses of a frame within reach, at which it is looked for again
+MOST_KNOWN = 2  # chosen: former poses of a frame within reach, from which it is tracked again
 NUM_KEPT = 4  # frames whose problems are kept: those used last
 BETWEEN_KEYS = ONE_PLACE.distance  # [m] between key frames, at least
 ELSEWHERE = ONE_PLACE.distance + 2.0 * REACH_SLACK  # [m] reach beyond which a camera may be at another place
