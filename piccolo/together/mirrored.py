@@ -18,8 +18,8 @@ from ..localization.means import Means
 from ..localization.run import make_attempts
 from .members import Member
 
-# Chosen: log odds of a mirrored photo against the photo as it is. Of 15 photos of a hospital none had more than
-# 0.41; one of the mirrored photos of racks had 2.3.
+# Chosen: log odds of a mirrored photo against the photo as it is. Of 15 photos of a hospital none had more
+# than 0.41; one of the mirrored photos of racks had 2.3.
 LEAST_LOG_ODDS = 1.0
 
 
@@ -52,7 +52,7 @@ def rule_out_mirrored(result: Result, min_confidence: float) -> Result:
 def compare_mirrored(member: Member, result: Result, means: Means) -> float:
     """Return the log odds of the best pose of the mirrored photo, less those of the poses of its result."""
     problem = member.found.problem.mirror()
-    asked, candidates = make_attempts(plan_attempts(problem), means)
-    mirrored = assess(asked.profile, choose(asked, rank(candidates), means.workers))
+    searched, candidates = make_attempts(plan_attempts(problem), means)
+    mirrored = assess(searched.profile, choose(searched, rank(candidates), means.workers))
     own = max(log_odds(standing, problem.method) for standing in result.standings)
     return log_odds(mirrored[0], problem.method) - own
