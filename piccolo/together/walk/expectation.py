@@ -1,4 +1,4 @@
-"""Where a frame of a walk is expected, from where it is tracked, and which end of tracking counts."""
+"""The pose at which a frame of a walk is expected, poses from which it is tracked, and ends that count."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
