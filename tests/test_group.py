@@ -245,6 +245,12 @@ def test_a_mirrored_photo_has_less_odds_than_its_mirror_image(is_mirrored):
     assert (odds > mirrored.LEAST_LOG_ODDS) == is_mirrored
 
 
+def test_a_mirror_image_that_is_not_found_tells_nothing(monkeypatch):
+    monkeypatch.setattr(mirrored, "make_attempts", lambda *_: (None, []))
+    member = SimpleNamespace(found=SimpleNamespace(problem=_problems()[0]))
+    assert mirrored.compare_mirrored(member, _belief("localized"), rooms.means(rooms.KNOWN)) == 0.0
+
+
 def _together(photos, num_threads=2):
     shots = [Shot(photo, rooms.KNOWN) for photo in photos]
     return localize_group(rooms.scan_map(SEED), shots, Workers(num_threads), Stopwatch())

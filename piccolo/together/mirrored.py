@@ -50,9 +50,15 @@ def rule_out_mirrored(result: Result, min_confidence: float) -> Result:
 
 
 def compare_mirrored(member: Member, result: Result, means: Means) -> float:
-    """Return the log odds of the best pose of the mirrored photo, less those of the poses of its result."""
+    """Return the log odds of the best pose of the mirrored photo, less those of the poses of its result.
+
+    They are 0 if the mirrored photo is not found: that tells nothing.
+    """
     problem = member.found.problem.mirror()
     searched, candidates = make_attempts(plan_attempts(problem), means)
-    mirrored = assess(searched.profile, choose(searched, rank(candidates), means.workers))
+    ranked = rank(candidates)
+    if ranked.best.score < problem.method.faint_score:
+        return 0.0
+    mirrored = assess(searched.profile, choose(searched, ranked, means.workers))
     own = max(log_odds(standing, problem.method) for standing in result.standings)
     return log_odds(mirrored[0], problem.method) - own
