@@ -32,7 +32,7 @@ def _open(cloud, folder, monkeypatch, num_made=1):
     """The map by `open_map`, and the warnings; `prepare_map` is called so many times."""
     made, heard = [], []
 
-    def prepare(*_, prior):
+    def prepare(*_):
         made.append(1)
         return scan_map(1)
 
