@@ -30,8 +30,8 @@ def __getattr__(name: str) -> object:
     """Import a public name, and keep it."""
     if name not in _modules:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(_modules[name], __name__), name)
-    return value
+    globals()[name] = getattr(import_module(_modules[name], __name__), name)
+    return globals()[name]
 
 
 def __dir__() -> list[str]:

@@ -22,7 +22,8 @@ from piccolo.photo.panorama import Panorama
 from piccolo.system.jobs.threads import Stopwatch, Workers
 from piccolo.together import group, mirrored
 from piccolo.together.bundle_search import Support
-from piccolo.together.group import Expected, localize_group, weigh_supports
+from piccolo.together.expected import Expected
+from piccolo.together.group import localize_group, weigh_supports
 from piccolo.together.links import FIRM, WEAK, Links, Placed, compute_shared, find_links, list_pairs, spread
 from piccolo.together.members import Shot
 

@@ -45,7 +45,7 @@ def prepare_gltf(
 
     In the file the materials are named by their index in the list. `read_file` returns a file that it names.
     """
-    head, text, data = _glb_parts(path, content) if content.startswith(GLB_MAGIC) else (b"", content, b"")
+    head, text, data = _split(path, content)
     try:
         tree = json.loads(text)
         _check_version(path, tree)
@@ -67,8 +67,10 @@ def prepare_gltf(
     return head + (struct.pack("<I4s", len(text), b"JSON") if head else b"") + text + data, materials
 
 
-def _glb_parts(path: Path, content: bytes) -> tuple[bytes, bytes, bytes]:
-    """Return the head of a GLB file, its JSON, and the chunks after it."""
+def _split(path: Path, content: bytes) -> tuple[bytes, bytes, bytes]:
+    """Return the head of a GLB file, its JSON, and the chunks after it; a glTF file is all JSON."""
+    if not content.startswith(GLB_MAGIC):
+        return b"", content, b""
     version, size, json_size = struct.unpack_from("<III", content.ljust(16, b"\0"), 4)
     if version != 2:
         raise InputError(f"{path}: GLB version {version}, {WANTED}")
