@@ -1,4 +1,4 @@
-"""Where the photos of a group were taken, by their own poses and by their matches with each other."""
+"""Positions and rotations of the photos of a group, by their own poses and by the matches between them."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
