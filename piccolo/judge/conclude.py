@@ -85,6 +85,12 @@ def follow_consensus(found: Result, consensus: Opinion, min_confidence: float) -
     return revised.take_belief(belief, min_confidence)
 
 
+def rule_out_mirrored(result: Result, min_confidence: float) -> Result:
+    """Return the result of a photo that other photos show to be mirrored, ruled out, with a warning."""
+    refused = replace(result, warnings=(*result.warnings, MIRRORED))
+    return refused.take_belief(result.belief.rule_out(Reason.MIRRORED), min_confidence)
+
+
 def contradict(who_has: str, focal: FocalLength, px: float) -> str:
     """Return a warning that pictures have another focal length than the one given."""
     return f"{who_has} a focal length of {px:.0f} px, not {focal.given_px:.0f}: check {focal.source}"

@@ -6,21 +6,17 @@ where they were taken.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 from ..evidence.examine import choose
+from ..judge.conclude import rule_out_mirrored
 from ..judge.probability import LOCALIZED, log_odds
-from ..judge.reasons import MIRRORED, Reason
+from ..judge.reasons import Reason
 from ..judge.result import Result
-from ..judge.selection import assess, rank
+from ..judge.selection import are_mirrored, assess, rank
 from ..localization.attempts import plan_attempts
 from ..localization.means import Means
 from ..localization.run import make_attempts
 from .members import Member
-
-# Chosen: log odds of a mirrored photo against the photo as it is. Of 15 photos of a hospital none had more
-# than 0.41; one of the mirrored photos of racks had 2.3.
-LEAST_LOG_ODDS = 1.0
 
 
 def refuse_mirrored(
@@ -29,24 +25,16 @@ def refuse_mirrored(
     """Return refused results of the localized photos among linked ones, if all were mirrored; else none.
 
     No mirrored photo is linked with one that is not. So the mirror images are searched if one of the photos
-    was ruled out as mirrored by itself, or if no localized photo was sure by itself. The photo with the
-    largest log odds, for or against, decides.
+    was ruled out as mirrored by itself, or if no localized photo was sure by itself.
     """
     localized = [k for k, result in results.items() if result.status == LOCALIZED]
     one_is_mirrored = any(Reason.MIRRORED in members[k].alone.belief.ruled_out for k in results)
     one_is_sure = any(members[k].alone.status == LOCALIZED for k in localized)
     if not localized or (one_is_sure and not one_is_mirrored):
         return {}
-    most = max((compare_mirrored(members[k], results[k], means) for k in localized), key=abs)
-    if most < LEAST_LOG_ODDS:
+    if not are_mirrored([compare_mirrored(members[k], results[k], means) for k in localized]):
         return {}
     return {k: rule_out_mirrored(results[k], min_confidence) for k in localized}
-
-
-def rule_out_mirrored(result: Result, min_confidence: float) -> Result:
-    """Return the result of a photo, ruled out as mirrored, with the warning."""
-    refused = result.take_belief(result.belief.rule_out(Reason.MIRRORED), min_confidence)
-    return replace(refused, warnings=(*refused.warnings, MIRRORED))
 
 
 def compare_mirrored(member: Member, result: Result, means: Means) -> float:
