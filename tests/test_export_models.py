@@ -211,3 +211,15 @@ def test_opensfm_has_the_camera_of_a_photo(tmp_path, camera):
     assert_input_error(
         "found the model FULL_OPENCV d1", lambda: export([refused], "opensfm", tmp_path / "x.json", Options())
     )
+
+
+@pytest.mark.parametrize("name", ["colmap", "opensfm", "nerfstudio"])
+def test_a_part_of_a_panorama_is_left_out_of_models_that_have_no_camera_for_it(tmp_path, name):
+    jpeg(tmp_path / "whole.jpg", SIZE)
+    whole = result(tmp_path / "whole.jpg", POSES[0])
+    cut = Camera("PARTIAL_EQUIRECTANGULAR", 400, 250, (81.5, 81.5, 200.0, 125.0))
+    part = result(tmp_path / "part.jpg", POSES[1], cameras=(Mount(cut),))
+    left_out = export([whole, part], name, tmp_path / "out", Options(images=tmp_path))
+    (why,) = left_out
+    assert why.startswith("found the model PARTIAL_EQUIRECTANGULAR, wanted")
+    assert left_out[why] == [str(tmp_path / "part.jpg")]

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ...geometry.pose import OPTICAL_FROM_CAM, translation, turn_axes
+from ...photo.camera.model import CUT_SPHERE
 from ...system.errors import InputError, import_optional
 from ...system.files.atomic import library_writing, replacing_folder
 from .posed_images import Options, PosedImage, write_offset_beside
@@ -47,6 +48,12 @@ def write_colmap(images: Sequence[PosedImage], out: Path, options: Options) -> N
         point = model.add_point3D(xyz, pycolmap.Track(track), rgb)
         model.point3D(point).error = 0.0
     write_model(model, out, partial(write_offset_beside, out, options))
+
+
+def check_model(image: PosedImage) -> None:
+    """Refuse a part of a panorama, whose camera model COLMAP does not have."""
+    if image.lens.model == CUT_SPHERE:
+        raise InputError(f"{image.path}: found the model {CUT_SPHERE}, wanted one that COLMAP has")
 
 
 def read_model(folder: Path) -> Any:

@@ -29,7 +29,7 @@ from ...system.files.atomic import (
     write_lines,
 )
 from ...system.files.json_file import read_bytes
-from .colmap import write_colmap
+from .colmap import check_model, write_colmap
 from .faces import write_faces
 from .posed_images import (
     NO_UTF8,
@@ -226,6 +226,7 @@ COLMAP = Format(
     MODEL | {"points", "faces", "into"},
     is_folder=True,
     forbidden=rf"\s|{NO_UTF8}",  # a blank ends a name, for COLMAP as for the readers in Python
+    check=check_model,
     cameras="own",
     data_set=("sparse/0", "images"),
 )

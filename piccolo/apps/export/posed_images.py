@@ -83,7 +83,7 @@ class Format(NamedTuple):
     forbidden: str = NO_UTF8  # regular expression of what a name can't have in it; empty for anything
     check: Callable[[PosedImage], object] | None = None  # raises InputError for a picture that it can't hold
     cameras: Literal["any", "own", "spheres"] = "any"  # of photos: no matter, an image each, or not at all
-    lenses: Lenses | None = None  # those that it has; None: COLMAP's, all of ours
+    lenses: Lenses | None = None  # those that it has; None: no matter
     data_set: tuple[str, str] = ("", "")  # of faces: path of the model, and of the folder that names begin in
 
 
