@@ -264,6 +264,7 @@ def _bend(rgb, top=0, bottom=0, across=1.0):
         ({"top": 0.1, "bottom": 0.1}, (360.0, 144.0), 0.0),
         ({"top": 0.02, "bottom": 0.12}, (360.0, 154.8), 9.0),
         ({"across": 0.95}, (342.0, 180.0), 0.0),
+        ({"across": 0.8}, (288.3, 180.0), 0.0),
     ],
 )
 def test_a_panorama_that_was_cut_and_resized_is_taken_as_the_scan_shows_it(bent, shown, horizon):

@@ -36,6 +36,7 @@ BY_CHANCE = 12.0  # sum of the squared deviations of all corrections that a righ
 MOST_SPHERE_CHANGE = np.array([0.2, 0.6, 0.4])  # corrections that are searched
 ANY = np.full(3, np.inf)
 HEIGHT_STARTS = -np.log([1.0, 0.9, 0.8, 0.72])  # corrections of the height from which descents begin
+WIDTH_STARTS = -np.log([0.9, 0.8])  # corrections of the width, where the height is as claimed
 LEAST_CUT = 0.1  # part of the height, at least, by whose cut the horizons of starts are spread
 HORIZONS = (-1.0, -0.5, 0.0, 0.5, 1.0)  # of starts: all, three quarters or half of the cut is at one end
 NUM_ENDS = 3  # of the descents on coarse cells: the best, which go on on finer ones
@@ -98,15 +99,21 @@ def count_deviations(estimate: LensEstimate) -> float:
     return float((np.abs(estimate.by_picture.values) / np.sqrt(CLAIM.deviations**2 + variances)).max())
 
 
+def list_starts() -> list[Array]:
+    """List the corrections (3,) from which descents begin: of the width alone, or of height and horizon."""
+    starts = [np.array([width, 0.0, 0.0]) for width in WIDTH_STARTS]
+    for height, share in itertools.product(HEIGHT_STARTS, HORIZONS):
+        horizon = share * max(1.0 - math.exp(-height), LEAST_CUT) * 0.5 * math.pi
+        starts.append(np.array([0.0, height, horizon]))
+    return starts
+
+
 def search_geometry(problem: Problem, pose: Pose, claimed: Camera, workers: Workers) -> FreeEnd:
     """Search the corrections of a panorama from several starts, on coarse cells, then on finer ones."""
     freedom = make_freedom(claimed)
     cells = problem.view_at(pose, "middle")
 
-    def begin(start: tuple[float, float]) -> FreeEnd:
-        height, share = start
-        horizon = share * max(1.0 - math.exp(-height), LEAST_CUT) * 0.5 * math.pi
-        values = np.array([0.0, height, horizon])
+    def begin(values: Array) -> FreeEnd:
         return descend_freely(cells, problem.photo.image("search"), freedom, pose, values, COARSE_LIMITS)
 
     def go_on(end: FreeEnd) -> FreeEnd:
@@ -116,6 +123,5 @@ def search_geometry(problem: Problem, pose: Pose, claimed: Camera, workers: Work
         fine = problem.view_at(end.pose, "fine")
         return descend_freely(fine, problem.photo.image("fine"), freedom, end.pose, end.values, FINE_LIMITS)
 
-    starts = list(itertools.product(HEIGHT_STARTS, HORIZONS))
-    ends = sorted(workers.map(begin, starts, "fit the panorama"), key=lambda end: end.loss)
+    ends = sorted(workers.map(begin, list_starts(), "fit the panorama"), key=lambda end: end.loss)
     return min(workers.map(go_on, ends[:NUM_ENDS], "fit the panorama"), key=lambda end: end.loss)

@@ -38,7 +38,7 @@ MAX_CALIBRATIONS = 4  # fits of a focal length
 SUSPECT = 0.8  # deviations between claim and picture, from which other geometries are searched
 CONTRADICTED_DEVIATIONS = 3.0  # between claim and picture, from which another geometry may replace the claim
 MIN_RETAKE_GAIN = 1.1  # least score with another geometry, as a multiple of the score with the claim
-MOST_ROUNDS = 3
+MOST_ROUNDS = 6
 CHECK_LIMITS = Limits(1.0, 8, 1e-3)
 FULL_LIMITS = Limits(0.7, 15, 1e-4)  # on points, where the claim does not hold
 HERE_LIMITS = Limits(0.7, 1, 1e-4)  # on points, where the claim holds: the end shows how exact it is
@@ -143,7 +143,8 @@ def retake_as_found(
 ) -> tuple[Problem, Selection, SphereFit] | None:
     """Search other geometries; return problem and poses with one that explains clearly more, else None.
 
-    A geometry that explains less than the claimed one is not refined.
+    A geometry that explains less than the claimed one is not refined. One that still changes after all rounds
+    is not known.
     """
     end = search_geometry(problem, found.best.pose, claimed, workers)
     if count_deviations(estimate_corrections(end, SPHERE_CURVATURE)) < CONTRADICTED_DEVIATIONS:
@@ -165,6 +166,8 @@ def retake_as_found(
         end = descend_freely(points, full, make_freedom(camera), pose, NO_CORRECTION, FULL_LIMITS)
         if np.all(np.abs(end.values) < CLAIM.deviations):
             break
+    else:
+        return None
     if best.best.score < MIN_RETAKE_GAIN * found.best.score:
         return None
     return problem, best, SphereFit(camera, estimate_corrections(end, SPHERE_CURVATURE), is_claimed=False)
