@@ -1,1 +1,1 @@
-"""Local features of the scan and of a photo: keypoints, matches, and the poses that matches vote for."""
+"""Local features of the scan and of a photo: keypoints, matches, and poses proposed by matches."""

@@ -1,9 +1,9 @@
-"""Pose hypotheses that matches vote for.
+"""Pose hypotheses from matches, each ranked by the number of matches that agree with it.
 
-A single match gives a rough pose: its keypoint's size gives the distance of the point, its direction and
-tangent give the rotation, if the camera is near the view from which the map has the feature. The poses that
-most other matches agree with, in direction, size and tangent, are made exact by P3P within RANSAC (Fischler
-and Bolles, 1981) on those matches.
+A single match gives a rough pose: the size of its keypoint gives the distance to the point, the direction and
+the tangent give the rotation. It is about right if the camera is near the pose at which the map's picture was
+drawn. The rough poses with which most other matches agree, in direction, size and tangent, are refined by P3P
+within RANSAC (Fischler and Bolles, 1981) on these matches.
 """
 
 import math
@@ -23,24 +23,24 @@ from ..system.kernels.jit import Scalar, inline_kernel, kernel
 from .matching import Matches
 from .p3p import p3p
 
-COS_ROUGH = math.cos(math.radians(20.0))  # a match whose error is smaller agrees roughly
-COS_EXACT = math.cos(math.radians(1.0))
-COS_TANGENT = math.cos(math.radians(40.0))
-SIZE_RATIO = 1.7  # of a keypoint's size as predicted and as found, at most
-LEAST_ANGLE = np.float32(1e-6)  # [rad] of a keypoint
-MAX_VOTERS = 1200  # single matches whose poses are tried
-TRIPLES_A_TASK = 64  # of them a thread tries at a time
-NUM_CLUSTERS = 48  # that are made exact, at most
-FAIR_PART = 0.2  # of the best pose's matches
-NUM_TRIPLES = 200  # of three matches, a cluster
-LEAST_MATCHES = 4  # that agree with a pose
-REFINEMENTS = 8  # steps
+COS_ROUGH = math.cos(math.radians(20.0))  # a match with a smaller error agrees roughly
+COS_EXACT = math.cos(math.radians(1.0))  # a match with a smaller error is an inlier
+COS_TANGENT = math.cos(math.radians(40.0))  # largest error of the tangent of a match that agrees
+SIZE_RATIO = 1.7  # largest ratio of a keypoint's predicted size to its own, or the reverse
+LEAST_ANGLE = np.float32(1e-6)  # [rad] a smaller keypoint counts as this
+MAX_VOTERS = 1200  # single matches that propose a rough pose, at most
+VOTERS_A_TASK = 64  # of these, as many as a thread takes at a time
+NUM_CLUSTERS = 48  # rough poses that are refined, at most
+FAIR_PART = 0.2  # poses with less than this fraction of the best one's matches are dropped
+NUM_TRIPLES = 200  # samples of three matches, for each rough pose
+LEAST_MATCHES = 4  # a pose with which fewer agree is dropped
+REFINEMENTS = 8  # steps of a refinement, at most
 REFINE_SCALE = math.radians(0.5)  # [rad] of the loss
 REFINE_TOLERANCE = 1e-7  # [rad + m] a shorter step ends the descent
 
 
 class MatchedPose(NamedTuple):
-    """A pose, and the number of the photo's features that it puts where the map has them."""
+    """A pose, and the number of the photo's features that agree with it."""
 
     pose: Pose
     num_matches: int
@@ -50,9 +50,10 @@ class MatchedPose(NamedTuple):
 def angular_equations(
     problem: tuple[Array, Array, float], R_cam_from_map: Array, center_map: Array, sums: Array
 ) -> None:
-    """Write the sums (29,) of normal_equations for bearings (N, 3), points (N, 3) [m], scale [rad].
+    """Write the sums (29,) of the normal equations of angular errors at a pose.
 
-    The scale is that of Geman and McClure's loss: much larger residuals hardly count.
+    `problem` holds bearings (N, 3) in the camera's frame, points (N, 3) [m] in the map's, and the scale [rad]
+    of Geman and McClure's loss: residuals much larger than this hardly count.
     The residual is u - b, with u the unit ray to the point and b the bearing. At distance r,
     du = w x u - (I - u u^T) d / r. Sums over its rows are products of u and b: no Jacobian is stored.
     """
@@ -95,7 +96,11 @@ descend_matches = kernel(levenberg_marquardt(angular_equations))
 
 @inline_kernel
 def agreement(m: Matches, j: int, R: Array, t: Array, cos_rough: float) -> Scalar:
-    """Return the cosine from a match's ray to its point; -1 below `cos_rough` or if the keypoint differs."""
+    """Return the cosine of a match's error at a pose; -1 if it does not agree.
+
+    The error is the angle between the match's ray and the direction of its point. A match agrees if this
+    cosine is at least `cos_rough`, and if size and tangent of the keypoint are about as predicted.
+    """
     ray = rotate(R, minus(row(m.points, j), t))
     length = math.sqrt(dot(ray, ray))
     cosine = dot(ray, row(m.rays, j)) / max(length, 1e-9)
@@ -109,7 +114,7 @@ def agreement(m: Matches, j: int, R: Array, t: Array, cos_rough: float) -> Scala
 
 @inline_kernel
 def write_turned(m: Matches, j: int, R: Array) -> None:
-    """Write the rotation (3, 3) that takes a match's direction and tangent to its ray and ray's tangent."""
+    """Write R_cam_from_map (3, 3), which turns a match's direction and tangent to its ray and ray tangent."""
     cam = (m.rays[j], m.ray_tangents[j], cross(m.rays[j], m.ray_tangents[j]))
     world = (m.directions[j], m.tangents[j], cross(m.directions[j], m.tangents[j]))
     for i in range(3):
@@ -119,7 +124,7 @@ def write_turned(m: Matches, j: int, R: Array) -> None:
 
 @inline_kernel
 def count_roughly_agreeing(m: Matches, R: Array, t: Array) -> int:
-    """Count the photo's features of which a match roughly agrees with a pose."""
+    """Count the photo's features that have a match which roughly agrees with a pose."""
     count = 0
     last = -1
     for i in range(len(m.query)):
@@ -131,7 +136,11 @@ def count_roughly_agreeing(m: Matches, R: Array, t: Array) -> int:
 
 @kernel
 def rough_poses(matches: Matches, voters: Int64s, rotations: Array, centers: Array, votes: Int64s) -> None:
-    """Write the pose (n, 3, 3), (n, 3) of each voter, a single match, and the number (n,) of its votes."""
+    """Write the rough pose, rotation (n, 3, 3) and centre (n, 3) [m], that each of some matches gives.
+
+    `voters` (n,) are the indices of these matches; `votes` (n,) gets the number of the photo's features that
+    roughly agree with each pose.
+    """
     m = matches
     for k in range(len(voters)):
         j = voters[k]
@@ -150,9 +159,9 @@ def count_exact(
     centers: Array,
     counts: Int64s,
 ) -> None:
-    """Count for each pose (n, 3, 3), (n, 3) the photo's features that a member agrees with within a degree.
+    """Write for each pose (n, 3, 3), (n, 3) [m] the number (n,) of the photo's features that are inliers.
 
-    The counts (n,) are written.
+    Only the matches at the indices `members` are tested, within the angle of COS_EXACT.
     """
     for n in range(len(counts)):
         count = 0
@@ -168,9 +177,10 @@ def count_exact(
 
 @kernel
 def sample_poses(columns: Array32, rotations: Array, centers: Array) -> int:
-    """Write poses (n, 3, 3), (n, 3) of three matches each, at most 4 NUM_TRIPLES; return their number.
+    """Write the poses (n, 3, 3), (n, 3) [m] of samples of three matches; return their number n.
 
-    `columns` (6, m) are points and rays of the matches. The samples are the same in every run.
+    A sample has up to four poses, so n is at most 4 NUM_TRIPLES. `columns` (6, m) are the matches' points [m]
+    and rays. The samples are the same in every run.
     """
     num_poses = 0
     bearings = np.empty((3, 3))
@@ -191,7 +201,7 @@ def sample_poses(columns: Array32, rotations: Array, centers: Array) -> int:
 def list_members(
     matches: Matches, R_cam_from_map: Array, center_map: Array, cos_rough: float, members: Int64s
 ) -> int:
-    """Write the indices of the matches that agree with a pose; return their number."""
+    """Write the indices of the matches that agree with a pose, as in `agreement`; return their number."""
     count = 0
     for j in range(len(matches.query)):
         if agreement(matches, j, R_cam_from_map, center_map, cos_rough) > 0.0:
@@ -201,18 +211,18 @@ def list_members(
 
 
 def find_inliers(matches: Matches, pose: Pose, cos_rough: float) -> Int64s:
-    """Return the indices of the matches that agree with a pose."""
+    """Return the indices (n,) of the matches that agree with a pose in the map, as in `agreement`."""
     members = np.empty(len(matches.query), np.int64)
     return members[: list_members(matches, pose.R_cam_from_world, pose.center_world, cos_rough, members)]
 
 
 def count_inliers(matches: Matches, pose: Pose, cos_agree: float = COS_EXACT) -> int:
-    """Count the features of the photo that a pose puts where the map has them, within an angle."""
+    """Count the photo's features that agree with a pose in the map, within the angle of a cosine."""
     return len(np.unique(matches.query[find_inliers(matches, pose, cos_agree)]))
 
 
 def exact_pose(matches: Matches, rough: Pose) -> MatchedPose | None:
-    """Return the pose that most matches near a rough one agree with, refined; None if they are too few."""
+    """Return the pose near a rough one with which most matches agree, refined; None if too few agree."""
     members = find_inliers(matches, rough, COS_ROUGH)
     if len(members) < LEAST_MATCHES:
         return None
@@ -231,7 +241,7 @@ def exact_pose(matches: Matches, rough: Pose) -> MatchedPose | None:
 
 
 def refine_on(matches: Matches, pose: Pose, num_steps: int) -> Pose:
-    """Refine a pose on the matches that agree with it."""
+    """Refine a pose on its inliers, the matches that agree with it within a degree."""
     members = find_inliers(matches, pose, COS_EXACT)
     rays = matches.rays[members].astype(np.float64)
     points = matches.points[members].astype(np.float64)
@@ -242,7 +252,7 @@ def refine_on(matches: Matches, pose: Pose, num_steps: int) -> Pose:
 
 
 def propose_poses(matches: Matches, count: int, workers: Workers) -> list[MatchedPose]:
-    """Return at most `count` poses that most matches agree with, best first, in the map's frame.
+    """Return at most `count` poses in the map, those with which most matches agree, best first.
 
     Poses with less than FAIR_PART of the best one's matches are left out.
     """
@@ -252,17 +262,16 @@ def propose_poses(matches: Matches, count: int, workers: Workers) -> list[Matche
     votes = np.empty(len(voters), np.int64)
 
     def vote(lo: int) -> None:
-        part = slice(lo, lo + TRIPLES_A_TASK)
+        part = slice(lo, lo + VOTERS_A_TASK)
         rough_poses(matches, voters[part], rotations[part], centers[part], votes[part])
 
-    list(workers.map(vote, range(0, len(voters), TRIPLES_A_TASK), "vote"))
+    list(workers.map(vote, range(0, len(voters), VOTERS_A_TASK), "vote"))
     order = np.argsort(-votes, kind="stable")
     kept = order[non_maximum_suppression(rotations[order], centers[order], NUM_CLUSTERS, VOTED)]
     rough = [Pose(rotations[k], centers[k]) for k in kept]
-    ends = workers.map(partial(exact_pose, matches), rough, "sample")
-    found = [end for end in ends if end]
-    least = max([LEAST_MATCHES, *(FAIR_PART * f.num_matches for f in found)])
-    found = sorted((f for f in found if f.num_matches >= least), key=lambda f: -f.num_matches)
-    R = np.array([f.pose.R_cam_from_world for f in found]).reshape(-1, 3, 3)
-    t = np.array([f.pose.center_world for f in found]).reshape(-1, 3)
-    return [found[k] for k in non_maximum_suppression(R, t, count, MATCHED)]
+    refined = [one for one in workers.map(partial(exact_pose, matches), rough, "sample") if one]
+    least = max([LEAST_MATCHES, *(FAIR_PART * one.num_matches for one in refined)])
+    ranked = sorted((one for one in refined if one.num_matches >= least), key=lambda one: -one.num_matches)
+    R = np.array([one.pose.R_cam_from_world for one in ranked]).reshape(-1, 3, 3)
+    t = np.array([one.pose.center_world for one in ranked]).reshape(-1, 3)
+    return [ranked[k] for k in non_maximum_suppression(R, t, count, MATCHED)]

@@ -10,16 +10,16 @@ from ..system.arrays import Array32, Bytes, Int64s, Mask
 from ..system.jobs.threads import Workers
 from .perspective_view import PerspectiveView, add_margin
 
-CONTRAST = 0.006  # least of a keypoint, as OpenCV counts it: plain walls have faint ones, and they hold
+CONTRAST = 0.006  # least contrast of a keypoint, as OpenCV counts it: faint ones on plain walls match well
 DESCRIPTOR_SIZE = 128
-ALONE = Workers()
+ALONE = Workers()  # the calling thread only
 
 
 class Keypoints(NamedTuple):
     """Keypoints of one sphere, in the axes of its picture."""
 
     rays: Array32  # (N, 3) unit directions
-    tangents: Array32  # (N, 3) unit directions across the ray in which the keypoint points
+    tangents: Array32  # (N, 3) unit vectors at right angles to the ray: the keypoint's orientation
     sizes: Array32  # (N,) diameter [rad]
     descriptors: Bytes  # (N, 128) RootSIFT (Arandjelovic, Zisserman 2012), times 255
 
@@ -29,7 +29,7 @@ class Keypoints(NamedTuple):
         return Keypoints(*taken)
 
     def mirror(self) -> "Keypoints":
-        """Return the keypoints of the picture mirrored left for right: rays, tangents and descriptors."""
+        """Return the keypoints as they are in the picture mirrored left to right."""
         left_for_right = np.array([1.0, -1.0, 1.0], np.float32)
         histograms = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1, :, -np.arange(8) % 8]
         descriptors = histograms.reshape(-1, DESCRIPTOR_SIZE)
@@ -39,7 +39,7 @@ class Keypoints(NamedTuple):
 def find_keypoints(
     gray: Bytes, is_valid: Mask, views: Sequence[PerspectiveView], workers: Workers = ALONE
 ) -> Keypoints:
-    """Find the keypoints of the valid part of an equirectangular picture (H, W), W = 2 H, in some views."""
+    """Find keypoints in some views of an equirectangular picture (H, W), W = 2 H, where it is valid."""
     picture = add_margin(gray)
     mask = add_margin(is_valid)
 
@@ -51,14 +51,14 @@ def find_keypoints(
 
 
 def find_in_view(image: Bytes, shown: Bytes, view: PerspectiveView) -> Keypoints:
-    """Find the keypoints in a picture (h, w) of a view where `shown` (h, w) is not 0."""
+    """Find the keypoints in the picture (h, w) of a view where `shown` (h, w) is 255; elsewhere it is 0."""
     inner = cv2.bitwise_and(cv2.erode(shown, np.ones((3, 3), np.uint8)), view.is_own)
     if not inner.any():
         return _nothing()
     sift = cv2.SIFT.create(contrastThreshold=CONTRAST, enable_precise_upscale=True)
-    found, shares = sift.detectAndCompute(image, inner)
-    keypoints = _on_sphere(found, np.asarray(shares, np.float32), view) if found else _nothing()
-    return keypoints.take(view.find_own(keypoints.rays))  # what views share counts once
+    points, descriptors = sift.detectAndCompute(image, inner)
+    keypoints = _on_sphere(points, np.asarray(descriptors, np.float32), view) if points else _nothing()
+    return keypoints.take(view.find_own(keypoints.rays))  # a keypoint in the overlap of two views counts once
 
 
 def join_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
@@ -71,8 +71,8 @@ def _nothing() -> Keypoints:
     return Keypoints(three, three, np.empty(0, np.float32), np.empty((0, DESCRIPTOR_SIZE), np.uint8))
 
 
-def _on_sphere(found: Sequence[cv2.KeyPoint], shares: Array32, view: PerspectiveView) -> Keypoints:
-    """Convert a view's keypoints to rays, and their SIFT descriptors (N, 128) to RootSIFT."""
+def _on_sphere(found: Sequence[cv2.KeyPoint], sift: Array32, view: PerspectiveView) -> Keypoints:
+    """Convert keypoints of a view to rays of the sphere, and their SIFT descriptors (N, 128) to RootSIFT."""
     height, width = view.rows.shape
     per_px = view.pixel
     points = np.array([(*k.pt, k.size, k.angle) for k in found])
@@ -84,8 +84,8 @@ def _on_sphere(found: Sequence[cv2.KeyPoint], shares: Array32, view: Perspective
     rays /= length
     tangents -= rays * np.sum(rays * tangents, axis=1, keepdims=True)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    sizes = points[:, 2] * per_px / length[:, 0] ** 1.5  # of the area that it covers
-    roots = np.sqrt(shares / np.maximum(shares.sum(axis=1, keepdims=True), 1.0))
+    sizes = points[:, 2] * per_px / length[:, 0] ** 1.5  # by the solid angle that it covers
+    roots = np.sqrt(sift / np.maximum(sift.sum(axis=1, keepdims=True), 1.0))
     return Keypoints(
         np.asarray(rays @ view.R_sphere_from_view.T, np.float32),
         np.asarray(tangents @ view.R_sphere_from_view.T, np.float32),

@@ -12,14 +12,14 @@ from ..system.arrays import Array32, Int32s, Mask
 from ..system.kernels.jit import kernel
 from .keypoints import Keypoints
 
-# of the best distance to the best elsewhere, at most, of a distinct match (Lowe, "Distinctive Image Features
-# from Scale-Invariant Keypoints", 2004)
+# largest ratio of the descriptors' distance of a distinct match to the least distance to a feature elsewhere
+# (Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", 2004)
 DISTINCT_RATIO = 0.8
-COS_ELSEWHERE = np.float32(math.cos(math.radians(2.0)))  # of what another picture shows
+COS_ELSEWHERE = np.float32(math.cos(math.radians(2.0)))  # features of a picture farther apart are elsewhere
 
 
 class Located(NamedTuple):
-    """Keypoints of a picture at a pose in the map, and how far away what they show is."""
+    """Keypoints of a picture whose pose in the map is known, and the ranges of the points that they show."""
 
     keypoints: Keypoints
     ranges: Array32  # (N,) [m]
@@ -30,16 +30,16 @@ class Matches(NamedTuple):
     """Pairs of a feature of the photo and one of the map, in the order of the photo's features."""
 
     query: Int32s  # (M,) index of the photo's feature
-    rays: Array32  # (M, 3) in the camera's frame
-    ray_tangents: Array32  # (M, 3)
-    angles: Array32  # (M,) diameter [rad]
+    rays: Array32  # (M, 3) unit, in the camera's frame
+    ray_tangents: Array32  # (M, 3) unit, in the camera's frame
+    angles: Array32  # (M,) diameter of the photo's keypoint [rad]
     points: Array32  # (M, 3) [m] in the map's frame
-    directions: Array32  # (M, 3) from which the map knows it, camera to point
-    tangents: Array32  # (M, 3)
-    sizes: Array32  # (M,) diameter [m]
+    directions: Array32  # (M, 3) unit, in the map's frame, from the camera of the map's picture to the point
+    tangents: Array32  # (M, 3) unit, in the map's frame
+    sizes: Array32  # (M,) diameter of the map's keypoint at the point [m]
 
     def take(self, kept: NDArray[np.integer] | Mask) -> "Matches":
-        """Return the matches at indices, or of a mask (M,)."""
+        """Return the matches at indices, or where a mask (M,) is True."""
         taken: list[Any] = [values[kept] for values in self]
         return Matches(*taken)
 
@@ -50,17 +50,19 @@ NO_MATCHES = Matches(np.empty(0, np.int32), _ROWS, _ROWS, _NUMBERS, _ROWS, _ROWS
 
 
 def is_distinct(squares: NDArray[np.number], elsewhere: NDArray[np.number], ratio: float) -> Mask:
-    """Return which matches (N,) are distinct, by a ratio of distances (Lowe).
+    """Return a mask (N,) of the matches that are distinct, by Lowe's test of the ratio of two distances.
 
-    Given are the squared distances of the best matches, and of the best elsewhere.
+    `squares` (N,) are the squared distances of the matches, `elsewhere` (N,) the least squared distances to
+    features elsewhere in the picture.
     """
     return np.asarray(squares < ratio**2 * elsewhere)
 
 
 def match_pictures(own: Keypoints, others: Keypoints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Match each feature with the most similar one, unless another elsewhere is nearly as similar.
+    """Match each feature with the most similar of the others, unless one elsewhere is nearly as similar.
 
-    Squared distances of 8-bit descriptors are whole numbers, exact in float32 by any matrix product.
+    Return the indices (M,) of the features that have a match, and of their matches. Squared distances of
+    8-bit descriptors are whole numbers, exact in float32 by any matrix product.
     """
     if not len(own.rays) or not len(others.rays):
         nothing = np.empty(0, np.intp)
@@ -79,13 +81,13 @@ def match_pictures(own: Keypoints, others: Keypoints) -> tuple[NDArray[np.intp],
 
 
 def match_located(own: Keypoints, picture: Located) -> Matches:
-    """Match keypoints of a photo with those of a picture whose pose is known."""
+    """Match keypoints of a photo with those of a picture whose pose in the map is known."""
     mine, theirs = match_pictures(own, picture.keypoints)
     return pair(own, mine, picture, theirs)
 
 
 def pair(own: Keypoints, mine: NDArray[np.intp], picture: Located, theirs: NDArray[np.intp]) -> Matches:
-    """Return the matches of keypoints (M,) of a photo with those (M,) of a picture whose pose is known."""
+    """Return the matches of a photo's keypoints at indices (M,) with a picture's at indices (M,)."""
     others, ranges, pose = picture
     R_map_from_cam = pose.R_cam_from_world.T
     directions = rotate_points(others.rays[theirs].astype(np.float64), R_map_from_cam)
@@ -104,7 +106,10 @@ def pair(own: Keypoints, mine: NDArray[np.intp], picture: Located, theirs: NDArr
 
 @kernel
 def find_elsewhere(distances: Array32, rays: Array32, nearest: NDArray[np.intp], elsewhere: Array32) -> None:
-    """Write the least distance (N,) of each row (N, M) but to those with rays (3, M) near the nearest's."""
+    """Write the least distance (N,) of each row (N, M), without columns whose rays are near the nearest's.
+
+    `rays` (3, M) are unit directions, `nearest` (N,) the column with the least distance of each row.
+    """
     x, y, z = rays
     for i in range(len(nearest)):
         k = nearest[i]
@@ -117,13 +122,13 @@ def find_elsewhere(distances: Array32, rays: Array32, nearest: NDArray[np.intp],
 
 
 def join_matches(parts: Sequence[Matches], counts: Sequence[int]) -> Matches:
-    """Join the matches of a photo's parts; the features, `counts` of them, are numbered part after part."""
+    """Join matches of a photo's parts, which have `counts` features; these are numbered part after part."""
     first = np.repeat(np.cumsum([0, *counts])[:-1], [len(part.query) for part in parts])
     query, *others = (np.concatenate(values) for values in zip(NO_MATCHES, *parts, strict=True))
     return Matches(query + first.astype(np.int32), *others)
 
 
 def merge_matches(parts: Sequence[Matches]) -> Matches:
-    """Merge matches of the same features of a photo with different points."""
+    """Merge matches of the same photo with several pictures, in the order of the photo's features."""
     merged: list[Any] = [np.concatenate(values) for values in zip(*parts, strict=True)]
     return Matches(*merged).take(np.argsort(merged[0], kind="stable"))

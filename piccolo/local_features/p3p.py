@@ -1,7 +1,8 @@
 """Poses of a camera from three matches: Persson and Nordberg, "Lambda Twist", ECCV 2018.
 
-A bearing is a unit ray in the camera's frame, anywhere on the sphere; a point is at a positive distance
-along it. With distances d and c_ij the cosine of two bearings, the triangle's sides, the longest 1, give
+A bearing is a unit ray in the camera's frame, anywhere on the sphere; a point is at a positive distance d
+along it. The triangle of the points is scaled so that its longest side is 1. With c_ij the cosine of two
+bearings and a_ij the square of a side,
     (1)  d_i^2 + d_j^2 - 2 c_ij d_i d_j = a_ij.
     (2)  M_0, M_1: the equations of the sides 01 and 02, each less a_ij times that of 12: conics d^T M d = 0
     (3)  det(M_m + x M_n) = 0: a degenerate conic of their pencil, which is two lines
@@ -17,9 +18,9 @@ from ..geometry.vectors import Triple, Vector, cross, dot, minus, row
 from ..system.arrays import Array
 from ..system.kernels.jit import Scalar, inline_kernel, kernel
 
-LEAST_SINE2 = 1e-10  # of the angles of the triangle of points: below, they lie on a line
+LEAST_SINE2 = 1e-10  # squared sine of the angle at a corner: points of a smaller one lie on a line
 LEAST_GAP = 5e-13  # 1 - cosine of two bearings: below a microradian they are the same
-SIDE_ROUNDING = 1e-9  # by which the sides of a solution may miss, relative
+SIDE_ROUNDING = 1e-9  # largest relative error of a solution's squared sides
 POLISHING = 4  # Newton steps on the distances
 
 Cofactors = tuple[float, float, float, float, float, float]  # of a symmetric matrix: 00, 01, 02, 11, 12, 22
@@ -45,7 +46,7 @@ def compute_axes(a: Vector, b: Vector) -> tuple[Triple, Triple, Triple]:
 
 @inline_kernel
 def simple_cubic_root(b: float, c: float, d: float) -> float:
-    """Return a real root of x^3 + b x^2 + c x + d beyond the extrema: Newton reaches it from outside."""
+    """Return a real root of x^3 + b x^2 + c x + d that is not between the extrema, by Newton's method."""
     square = b * b - 3.0 * c
     x = -b / 3.0
     if square > 0.0:
@@ -80,7 +81,7 @@ def adjugate(m: Array) -> Cofactors:
 
 @inline_kernel
 def trace_product(a: Cofactors, m: Array) -> float:
-    """Return the trace of a symmetric matrix of six entries times another, (3, 3)."""
+    """Return the trace of the product of two symmetric matrices, the first given by its six entries."""
     diagonal = a[0] * m[0, 0] + a[3] * m[1, 1] + a[5] * m[2, 2]
     trace: float = diagonal + 2.0 * (a[1] * m[0, 1] + a[2] * m[0, 2] + a[4] * m[1, 2])
     return trace
@@ -88,9 +89,9 @@ def trace_product(a: Cofactors, m: Array) -> float:
 
 @inline_kernel
 def degenerate_conic(conics: Array) -> int:
-    """Turn one of two conics (2, 3, 3) into a degenerate one of their pencil (3); return the other's index.
+    """Replace one of two conics (2, 3, 3) by a degenerate one of their pencil (3); return the other's index.
 
-    x is a root of a cubic whose leading coefficient is det M_n.
+    The factor x of (3) is a root of a cubic whose leading coefficient is det M_n.
     """
     first = adjugate(conics[0])
     second = adjugate(conics[1])
@@ -177,7 +178,10 @@ def meet(line: Array, conic: Array, ratios: Array) -> int:
 
 @inline_kernel
 def polish_distances(ratios: Array, cosines: Triple, sides2: tuple[Scalar, Scalar]) -> bool:
-    """Scale distances (3,) known up to a factor, polish them by Newton on (1); False if they do not fit."""
+    """Scale distances (3,), known up to a factor, and polish them by Newton's method on (1).
+
+    Return False if they do not solve (1), or if one is not positive.
+    """
     c01, c02, c12 = cosines
     a01, a02 = sides2
     d0 = ratios[0]
@@ -211,7 +215,7 @@ def polish_distances(ratios: Array, cosines: Triple, sides2: tuple[Scalar, Scala
 
 @inline_kernel
 def order_corners(points: Array) -> tuple[int, int, int, Scalar]:
-    """Return the corners, those of the longest side last, and that side's squared length."""
+    """Return the corners' indices, the ends of the longest side last, and its squared length."""
     first = 0
     longest2: Scalar = -1.0
     for i in range(3):
@@ -247,9 +251,10 @@ def solve_triangle(d01: Vector, d02: Vector, e01: Vector, e02: Vector, R: Array)
 
 @kernel
 def p3p(bearings: Array, points: Array, rotations: Array, centers: Array) -> int:
-    """Write the poses that see three points, R_cam_from_map (4, 3, 3), centers (4, 3) [m]; return how many.
+    """Write up to four poses that see three points at three bearings; return their number.
 
-    Bearings (3, 3) and points (3, 3) [m] are in rows. Collinear points and equal bearings have no pose.
+    Bearings (3, 3) and points (3, 3) [m] are in rows. `rotations` (4, 3, 3) get R_cam_from_map, `centers`
+    (4, 3) [m] the camera's centres in the map. Collinear points and equal bearings have no pose.
     """
     i0, i1, i2, longest2 = order_corners(points)
     b0 = bearings[i0]

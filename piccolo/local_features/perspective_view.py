@@ -1,4 +1,4 @@
-"""Perspective views of a sphere's picture: a set that covers the sphere, or one around what a photo shows."""
+"""Perspective views of a sphere's picture: a set that covers the sphere, or one around a photo's content."""
 
 import math
 from collections.abc import Sequence
@@ -11,18 +11,18 @@ import numpy as np
 from ..geometry.sphere import compute_pixels, pixel_rays
 from ..system.arrays import Array, Array32, Bytes, Floats, Int64s, Mask
 
-FIELD_DEG = 65.0  # of a view of the set that covers the sphere, across
-PICTURE_MARGIN = 8  # [px] of the sphere's picture around it, so that views may cross the seam
-# azimuth and elevation of the views' middles [deg]; at the poles pictures show floor and ceiling, or nothing
+FIELD_DEG = 65.0  # [deg] width of a view in the set that covers the sphere
+PICTURE_MARGIN = 8  # [px] that are added around the sphere's picture, so that views may cross the seam
+# azimuth and elevation [deg] of the views' middles; none at the poles, which show floor, ceiling or nothing
 VIEWS_DEG = [(45.0 * k, 0.0) for k in range(8)]
 VIEWS_DEG += [(60.0 * k + 30.0, elevation) for elevation in (45.0, -45.0) for k in range(6)]
-NUM_SIDES = 4
+NUM_SIDES = 4  # views of a whole photo to its sides
 Image = TypeVar("Image", Bytes, Mask)
-# of the faces of a cube; nothing is seen in those at the poles, which bound the sides
+# the same of the faces of a cube; the two at the poles are not used, but keypoints there belong to no side
 FACES_DEG = [*((90.0 * k, 0.0) for k in range(NUM_SIDES)), (0.0, 90.0), (0.0, -90.0)]
-STRETCH = 1.2  # tangent of the angle between the middle of a view around a photo and its edge, at most
-VIEW_AROUND = 0.07  # [rad] that such a view shows more than the photo
-MULTIPLE = 16  # [px] of the sides of such a view
+STRETCH = 1.2  # largest tangent of the angle from the middle of a view around a photo to its edge
+VIEW_MARGIN = 0.07  # margin of such a view around the photo, at a distance of 1: 4 degrees
+MULTIPLE = 16  # [px] width and height of such a view are multiples of this
 
 
 class PerspectiveView(NamedTuple):
@@ -30,11 +30,11 @@ class PerspectiveView(NamedTuple):
 
     R_sphere_from_view: Array  # (3, 3), +x the view's middle, +y left, +z up
     pixel: float  # width of a pixel, at a distance of 1
-    columns: Array32  # (h, w) of each pixel in the sphere's picture with its margin
-    rows: Array32
+    columns: Array32  # (h, w) column of each pixel in the sphere's picture with its margin
+    rows: Array32  # (h, w) and its row
     is_own: Bytes  # (h, w) 255 where no other view's middle is nearer, and a little beyond
-    middles: Array  # (N, 3) of the views of the set
-    place: int  # of this one among them
+    middles: Array  # (N, 3) unit directions of the middles of all views of the set
+    place: int  # index of this view among them
 
     @property
     def focal(self) -> float:
@@ -51,7 +51,7 @@ class PerspectiveView(NamedTuple):
         return np.asarray(cv2.remap(mask, self.columns, self.rows, cv2.INTER_NEAREST), np.uint8)
 
     def find_own(self, rays: Floats) -> Int64s:
-        """Return the indices of the directions (N, 3) that are nearer to this middle than to any other."""
+        """Return the indices of the directions (N, 3) whose nearest middle of the set is this view's."""
         return np.flatnonzero(np.argmax(rays @ self.middles.T, axis=1) == self.place)
 
     def project(self, rays: Floats) -> tuple[Int64s, Int64s]:
@@ -65,7 +65,7 @@ class PerspectiveView(NamedTuple):
 
 @lru_cache(maxsize=4)
 def cover_sphere(width: int) -> list[PerspectiveView]:
-    """Return the perspective views of a sphere's picture of `width`, with its resolution in their middles."""
+    """Return views that cover a sphere's picture `width` [px] wide, as fine as it in their middles."""
     reach = math.tan(math.radians(FIELD_DEG / 2.0))
     side = round(2.0 * reach * width / math.tau)
     return make_set(VIEWS_DEG, side, 2.0 * reach / side, width)
@@ -73,16 +73,19 @@ def cover_sphere(width: int) -> list[PerspectiveView]:
 
 @lru_cache(maxsize=4)
 def list_sides(width: int) -> list[PerspectiveView]:
-    """Return four views to the sides of a sphere's picture of `width`: faces of a cube, and a little more."""
+    """Return four views to the sides of a sphere's picture `width` [px] wide: cube faces with a margin."""
     pixel = math.tau / width
-    side = math.ceil(2.0 * (1.0 + VIEW_AROUND) / pixel / MULTIPLE) * MULTIPLE
+    side = math.ceil(2.0 * (1.0 + VIEW_MARGIN) / pixel / MULTIPLE) * MULTIPLE
     return make_set(FACES_DEG, side, pixel, width)[:NUM_SIDES]
 
 
 def make_set(
     middles_deg: Sequence[tuple[float, float]], side: int, pixel: float, width: int
 ) -> list[PerspectiveView]:
-    """Make square views (side, side) around middles, azimuth and elevation [deg]; `pixel` as of its field."""
+    """Make square views (side, side) around middles given by azimuth and elevation [deg].
+
+    `pixel` is that of `PerspectiveView`, `width` [px] that of the sphere's picture.
+    """
     turns = []
     for angles in np.radians(middles_deg):
         (c, ce), (s, se) = np.cos(angles), np.sin(angles)
@@ -92,14 +95,14 @@ def make_set(
 
 
 def view_around(is_valid: Mask, focal: float, width: int) -> PerspectiveView | None:
-    """Return a view of all that a mask (H, W) of the sphere shows, None if that is too wide for a picture.
+    """Return a view of all valid pixels of a mask (H, W) of the sphere; None if they are too far apart.
 
-    The view is one of a sphere's picture of `width`, and has a focal length [px] of its own.
+    `focal` [px] is the view's focal length, `width` [px] that of the sphere's picture from which it is cut.
     """
     if not is_valid.any():
         return None
     rays = pixel_rays(is_valid.shape[1])[is_valid]
-    middle = rays.sum(axis=0) + np.array([1e-9, 0.0, 0.0])  # of the whole sphere it has no direction
+    middle = rays.sum(axis=0) + np.array([1e-9, 0.0, 0.0])  # the mean of the whole sphere has no direction
     middle /= np.linalg.norm(middle)
     up = np.array([0.0, 0.0, 1.0]) if abs(middle[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
     left = np.cross(up, middle)
@@ -108,7 +111,7 @@ def view_around(is_valid: Mask, focal: float, width: int) -> PerspectiveView | N
     local = rays @ R_sphere_from_view
     if local[:, 0].min() <= 1.0 / math.hypot(1.0, STRETCH):
         return None
-    half_width, half_height = (np.abs(local[:, k] / local[:, 0]).max() + VIEW_AROUND for k in (1, 2))
+    half_width, half_height = (np.abs(local[:, k] / local[:, 0]).max() + VIEW_MARGIN for k in (1, 2))
     shape = tuple(math.ceil(2.0 * focal * half / MULTIPLE) * MULTIPLE for half in (half_height, half_width))
     return make_view(R_sphere_from_view, 1.0 / focal, (shape[0], shape[1]), width, middle[None], 0)
 
@@ -116,8 +119,11 @@ def view_around(is_valid: Mask, focal: float, width: int) -> PerspectiveView | N
 def make_view(
     R_sphere_from_view: Array, pixel: float, shape: tuple[int, int], width: int, middles: Array, place: int
 ) -> PerspectiveView:
-    """Make a view of `shape` (h, w) of a sphere's picture of `width`; `pixel` as of PerspectiveView."""
-    # of the pixels' centres, at a distance of 1
+    """Make a view of `shape` (h, w) of a sphere's picture `width` [px] wide.
+
+    `pixel`, `middles` (N, 3) and `place` are those of `PerspectiveView`.
+    """
+    # positions of the pixels' centres on the plane at a distance of 1
     centers = (0.5 * pixel * n * (1.0 - (2.0 * np.arange(n) + 1.0) / n) for n in reversed(shape))
     left, up = np.meshgrid(*centers)
     rays = np.stack([np.ones_like(left), left, up], axis=-1) @ R_sphere_from_view.T

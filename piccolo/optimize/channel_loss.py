@@ -1,7 +1,7 @@
 """The loss of the default method: locally normalised channels of points against those of the panorama.
 
-A residual's loss is that of Geman and McClure, of a scale [8-bit levels]. A point on masked pixels costs half
-of the largest loss.
+The loss of a residual is Geman and McClure's, with a scale [8-bit levels]. A point on masked pixels costs
+half of the largest loss.
 """
 
 import math
@@ -19,14 +19,14 @@ from ..system.kernels.jit import Scalar, inline_kernel, kernel
 from .normal_equations import block_adder
 
 NUM_MOMENTS = 10
-FLAT_BLOCK = 6.0  # [levels] a smaller deviation of a block's channels counts as this
+FLAT_BLOCK = 6.0  # [levels] a smaller standard deviation of a block's channels counts as this
 ZERO = np.float32(ZERO_LEVEL)
 
 
 class ChannelProblem(NamedTuple):
-    """Points with channels, and the image that they are compared with."""
+    """Points with channels, the image with which they are compared, and the scale of the loss."""
 
-    points: Array32  # (3, N) [m]
+    points: Array32  # (3, N) [m] in the frame of the pose
     channels: Array32  # (3, N) [8-bit levels]
     weights: Array32  # (N,)
     texels: Int32s  # of the panorama's channels
@@ -44,7 +44,7 @@ def read_channels(
 
 @inline_kernel
 def beyond_chance(correlation: float) -> float:
-    """Return the part of a block's correlation that exceeds those of wrong poses, in [0, 1]."""
+    """Return by how much a block's correlation exceeds that of wrong poses, scaled to [0, 1]."""
     return max(correlation - CHANCE_CORRELATION, 0.0) / (1.0 - CHANCE_CORRELATION)
 
 
@@ -55,7 +55,7 @@ add_channels = block_adder(read_channels, inline_geman_mcclure)
 def channel_equations(
     problem: ChannelProblem, R_cam_from_world: Array, center_world: Array, sums: Array
 ) -> None:
-    """Write loss, count, gradient and matrix (29,) of a problem at a pose."""
+    """Write loss, sum of weights, gradient and matrix (29,) of a problem at a pose."""
     points, channels, weights, texels, width, scale = problem
     R, t = R_cam_from_world, center_world
     colors = (channels[0], channels[1], channels[2], weights)
@@ -102,9 +102,9 @@ def correlate(
     center_world: Array,
     sums: Array,
 ) -> None:
-    """Write the SUMS of the points' channels a and the image's channels b by block (B, 10), weighted.
+    """Write the weighted sums (B, 10) over each block of the points' channels a and the image's channels b.
 
-    They are the products a b, a^2 and b^2 over all channels, the weight, and a and b of each channel.
+    The ten are a b, a^2 and b^2, each added over the three channels; the weight; a and then b by channel.
     """
     sums[:] = 0.0
     p = make_chunk()
@@ -156,10 +156,10 @@ def score(
     R_cam_from_world: Array,
     center_world: Array,
 ) -> float:
-    """Score a pose: sum each block's correlation beyond chance, times the area that points and image share.
+    """Return the score of a pose: the sum over blocks of correlation beyond chance times the area in common.
 
-    The weights are solid angles as fractions of the sphere, `blocks` (N,) the block of each point. An
-    occluder costs the area that it hides and no more.
+    That area is where both points and image show something. `weights` (N,) are solid angles as fractions of
+    the sphere, `blocks` (N,) the block of each point. An occluder costs the area that it hides and no more.
     """
     sums = np.empty((NUM_BLOCKS, NUM_MOMENTS))
     correlate(points, channels, weights, blocks, texels, width, R_cam_from_world, center_world, sums)

@@ -1,7 +1,8 @@
 """The normal equations of a pose together with corrections of the picture's geometry (self-calibration).
 
-A correction moves the ray of a point by its `moves`; its column of the Jacobian is the image gradient along
-that. To the rows [p x g, -g] of `normal_equations` it adds m . g for each correction.
+A correction displaces a point, in the camera's axes, by a vector m for each unit of the correction (`moves`).
+Its column of the Jacobian is the image gradient g along that vector, m . g. The columns of the corrections
+follow those of the pose, [p x g, -g] in `normal_equations`.
 """
 
 from typing import NamedTuple
@@ -15,14 +16,14 @@ from ..system.arrays import Array, Array32, Int64s
 from ..system.kernels.jit import F0, kernel
 from .channel_loss import ChannelProblem
 
-NUM_OF_POSE = 6
+NUM_OF_POSE = 6  # numbers of a pose's step
 
 
 class FreeSums(NamedTuple):
-    """Sums of the equations over parts of the points; n is 6 of the pose, and then the corrections."""
+    """Sums of the equations over parts of the points; the n unknowns are 6 of the pose, then corrections."""
 
     loss: Array  # (parts,)
-    weight: Array  # (parts,) of the points on pixels that count
+    weight: Array  # (parts,) sum of the weights of the points on valid pixels
     gradients: Array  # (parts, n)
     matrices: Array  # (parts, n, n)
 
@@ -37,10 +38,10 @@ def write_free_equations(
     gradients: Array,
     matrices: Array,
 ) -> None:
-    """Write the sums of `FreeSums` for points in the camera's axes, and their moves (p, 3, N) by corrections.
+    """Write the sums of `FreeSums` for points in the camera's axes; p corrections have `moves` (p, 3, N).
 
-    Of each matrix the upper triangle is written. Part k is the points from begins[k] to begins[k + 1]. Points
-    on masked pixels add nothing.
+    Only the upper triangle of each matrix is written. Part k is the points from begins[k] to begins[k + 1].
+    Points on masked pixels add nothing.
     """
     points, channels, weights, texels, width, scale = problem
     n = NUM_OF_POSE + len(moves)
@@ -112,7 +113,10 @@ def write_free_equations(
 
 
 def sum_free_equations(problem: ChannelProblem, moves: Array32, begins: Int64s) -> FreeSums:
-    """Return the sums for each part of points in the camera's axes, which have moves (p, 3, N)."""
+    """Return the sums over each part of points in the camera's axes, with `moves` (p, 3, N) by corrections.
+
+    Part k is the points from begins[k] to begins[k + 1].
+    """
     parts = len(begins) - 1
     n = NUM_OF_POSE + len(moves)
     sums = FreeSums(np.empty(parts), np.empty(parts), np.empty((parts, n)), np.empty((parts, n, n)))

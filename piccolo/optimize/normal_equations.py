@@ -28,10 +28,10 @@ def block_adder(
 ) -> Adder[Colors]:
     """Make a kernel that adds points to the sums (29,) of the normal equations, in float32 within chunks.
 
-    read_point(colors, i) returns three channels [8-bit levels] and a weight; robust(square, scale) returns,
-    for a residual's squared length, its loss and its weight: the derivative of the loss by half the square.
-    The kernel takes coordinates, colours, texels and width of the image, rotation and centre of the pose, the
-    scale of `robust`, and the sums.
+    read_point(colors, i) returns three channels [8-bit levels] and a weight. robust(square, scale) takes the
+    squared length of a residual and returns its loss and its weight, the derivative of the loss by half the
+    square. The kernel takes coordinates, colours, texels and width of the image, rotation and centre of the
+    pose, the scale of `robust`, and the sums.
     """
 
     @inline_kernel

@@ -2,11 +2,11 @@
 
     L(R, t) = (1 / N') sum_i || I(Pi(R (x_i - t))) - c_i ||_2
 
-over the N' points that do not fall on masked pixels; colours in [0, 1], a mean of unsquared norms. Steps are
-those of normal_equations.
+over the N' points that do not fall on masked pixels. Colours are in [0, 1]; norms are not squared. Steps of a
+pose are those of `normal_equations`.
 
-Kernels sum float32 within chunks of 512 points, and these in float64, in order, within blocks of 4,096 and
-over them.
+Kernels sum in float32 within chunks of 512 points. The sums of the chunks are added in float64, in order,
+first within blocks of 4,096 points and then over the blocks.
 """
 
 import math
@@ -33,8 +33,8 @@ from ..system.kernels.jit import F0, F1, Scalar, inline_kernel, kernel
 from .normal_equations import block_adder
 
 POINTS_A_SUM = 4096
-# A pose at which masked pixels hide more of the cloud has no loss. If only a part of the panorama is valid,
-# this fraction is multiplied by the square of that part: a crop may face the nearer wall.
+# A pose has no loss if a smaller fraction of the points falls on valid pixels. If only a part of the panorama
+# is valid, this is multiplied by the square of that part: a crop may face the nearer wall, with fewer points.
 MIN_SHOWN_SHARE = 0.5
 HALF_LEVEL = np.float32(0.5)  # a residual below half an 8-bit level has the weight of half a level
 TO_UNIT = 1.0 / 255.0
@@ -45,7 +45,7 @@ Points = tuple[Array32, Array32, Array32, Int32s]  # x, y, z [m] and packed colo
 def loss_blocks(
     points: Points, image: Texels, R_cam_from_world: Array, center_world: Array, sums: Array
 ) -> None:
-    """Write for each block (blocks, 2): the sum of the residual norms [8-bit levels], the count of points."""
+    """Write, by block (blocks, 2), the sum of residual norms [8-bit levels] and the count of points."""
     x, y, z, rgbx = points
     p = make_chunk()
     for block in range(len(sums)):
@@ -74,7 +74,7 @@ def loss_blocks(
 
 @inline_kernel
 def read_packed(rgbx: Int32s, i: np.uintp) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """Return channels [8-bit levels] and weight of a point of packed colour."""
+    """Return channels [8-bit levels] and weight, always 1, of a point with a packed colour."""
     c = rgbx[i]
     return channel(c, 0), channel(c, 8), channel(c, 16), F1
 
@@ -86,7 +86,7 @@ add_packed = block_adder(read_packed, inline_absolute)
 def normal_blocks(
     points: Points, image: Texels, R_cam_from_world: Array, center_world: Array, sums: Array
 ) -> None:
-    """Write for each block (blocks, 29): loss, count, gradient, upper triangle of sum J^T J / norm."""
+    """Write, by block (blocks, 29), loss, count, gradient and the upper triangle of sum J^T J / norm."""
     x, y, z, rgbx = points
     R, t = R_cam_from_world, center_world
     for block in range(len(sums)):
@@ -98,8 +98,8 @@ def normal_blocks(
 
 
 def _sum_blocks(blocks: Callable[..., None], points: PackedPoints, texels: Texels, pose: Pose) -> Array:
-    """Sum over all points, in float64, the rows that a kernel writes, one a block."""
-    if not np.abs(pose.center_world).max() < FARTHEST_POINT:  # NaN included: a kernel must not gather there
+    """Call a kernel that writes a row of sums for each block of points; return the total of these rows."""
+    if not np.abs(pose.center_world).max() < FARTHEST_POINT:  # or NaN: a kernel would read outside the image
         return np.zeros(NUM_SUMS)
     sums = np.empty((-(-len(points) // POINTS_A_SUM), NUM_SUMS if blocks is normal_blocks else 2))
     arrays = points.x, points.y, points.z, points.rgbx

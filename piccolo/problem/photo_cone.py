@@ -1,4 +1,4 @@
-"""A cone around what a photo shows: cells outside of it have no part in the first descents."""
+"""The cone around what a photo shows; the first descents use only the cells of a view inside it."""
 
 import math
 
@@ -12,11 +12,11 @@ from ..photo.panorama.texels import Texels, find_valid
 from ..system.arrays import Array, Int64s
 from ..system.kernels.jit import inline_kernel
 
-CONE_MARGIN = math.radians(20.0)  # that a camera turns in a descent, at most
+CONE_MARGIN = math.radians(20.0)  # [rad] a camera turns by less than this in a descent
 
 
 def find_cone(image: Texels, margin: float = CONE_MARGIN) -> Cone:
-    """Return the cone, in the camera's frame, around the pixels that an image shows, wider by `margin`."""
+    """Return the cone in the camera's frame around an image's valid pixels, widened by `margin` [rad]."""
     return cone_around(pixel_rays(image.width)[find_valid(image)]).widen(margin)
 
 
@@ -29,7 +29,11 @@ def select_cells(
     center: Array,
     kept: Int64s,
 ) -> int:
-    """Write the indices of the cells with offsets (3, N) that lie in a cone; return their number."""
+    """Write the indices of the cells that lie in a camera's cone into `kept`; return their number.
+
+    `offsets` (3, N) times `unit` [m] are the cells' positions; `center` (3,) [m] is the camera's, in the same
+    frame. The cone is in the camera's axes.
+    """
     axis = rotate(R_cam_from_map.T, (cone.x, cone.y, cone.z))
     num = 0
     for j in range(offsets.shape[1]):

@@ -1,4 +1,4 @@
-"""A photo at the sizes at which it is compared: each image is made once, when it is first asked for."""
+"""A photo at the sizes at which it is compared with the scan; each image is made once, at its first use."""
 
 import math
 from dataclasses import dataclass, replace
@@ -30,22 +30,22 @@ from .profile import ImageScale, ImageScales
 from .stages import ImageName
 
 LEAST_WHOLE = 0.9  # least fraction of the sphere that a whole photo shows
-ALL_SHOWN = 0.98  # of the sphere: a photo that shows more counts as showing all cells
-SEEN_SHIFT = math.radians(5.0)  # by which what is seen at a pose shifts from one pose to another near it
+ALL_SHOWN = 0.98  # fraction of the sphere: a photo that shows more counts as showing all cells
+SEEN_SHIFT = math.radians(5.0)  # by which the direction of a point changes between nearby poses, at most
 MIRROR = np.diag([1.0, -1.0, 1.0])  # mirrors a camera's axes left for right
 
 
 class Images(NamedTuple):
-    """A photo's locally normalised channels at several scales."""
+    """A photo's locally normalised channels at several sizes; `ImageScales` has the sizes."""
 
-    full: Once[Texels]  # for the last millimetres
+    full: Once[Texels]  # for the last descent, on points
     fine: Once[Texels]  # for fine views
     middle: Once[Texels]  # for middle views
     search: Once[Texels]  # for prepared views
 
 
 class Seen(NamedTuple):
-    """Views that show all of a photo, and the keypoints in them."""
+    """Perspective views that together show all of a photo, and the keypoints found in them."""
 
     views: list[PerspectiveView]
     keypoints: Keypoints
@@ -53,15 +53,15 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True)
 class PhotoImages:
-    """The images of a photo at the sizes at which it is compared; immutable, as threads share it."""
+    """The images of a photo at the sizes at which it is compared; immutable, as threads share them."""
 
-    panorama: Panorama  # at the width of its features
+    panorama: Panorama  # at the width at which keypoints are found
     images: Images
-    small: Texels  # colours at the size of fine images, at which poses are compared
-    seen: Once[Seen]  # what verification compares with the scan drawn at a pose; it is asked with workers
-    shown: Once[Cone]  # the cone around what it shows, in the camera's axes
-    R_cam_from_level: Array  # (3, 3) how the camera was tilted where gravity is known
-    has_tilt: bool  # R_cam_from_level is known, from metadata or a gravity vector
+    small: Texels  # colours, not normalised, at the size of the fine image; poses are scored by it
+    seen: Once[Seen]  # compared with the scan drawn at a pose; called with the workers
+    cone: Once[Cone]  # around what the photo shows, in the camera's axes
+    R_cam_from_level: Array  # (3, 3) tilt of the camera; the identity if it is not known
+    has_tilt: bool  # True if R_cam_from_level is known, from metadata or a gravity vector
     scales: ImageScales
 
     @property
@@ -70,12 +70,12 @@ class PhotoImages:
         return self.small.valid_share < LEAST_WHOLE
 
     def image(self, name: ImageName) -> Texels:
-        """Return one of the images."""
-        found: Texels = getattr(self.images, name)()
-        return found
+        """Return the image of this name."""
+        image: Texels = getattr(self.images, name)()
+        return image
 
     def find_shown_cells(self, num_rings: int, pose: Pose) -> Mask:
-        """Return a mask (N,) of the grid cells around a pose that the photo shows."""
+        """Return the mask (N,) of the cells of a grid around a pose that the photo, taken there, shows."""
         grid = make_grid(num_rings)
         if self.small.valid_share > ALL_SHOWN:
             return np.ones(len(grid), np.bool_)
@@ -83,13 +83,13 @@ class PhotoImages:
         return np.asarray(self.panorama.is_valid[compute_indices(rays_cam, self.panorama.is_valid.shape[1])])
 
     def find_cone(self, num_rings: int, pose: Pose) -> Cone:
-        """Return the cone, in the map's axes, around the cells of a grid that the photo shows."""
+        """Return the cone, in the map's axes, around the grid cells that the photo at a pose shows."""
         if not self.is_partial:
             return EVERYWHERE
-        return self.shown().widen(SEEN_SHIFT + 1.5 * math.pi / num_rings).turn(pose.R_cam_from_world.T)
+        return self.cone().widen(SEEN_SHIFT + 1.5 * math.pi / num_rings).turn(pose.R_cam_from_world.T)
 
     def mask(self, is_hidden: Mask) -> "PhotoImages":
-        """Return the photo without pixels (h, 2 h), the rest normalised again."""
+        """Return the photo without the pixels that a mask (h, 2 h) hides; the rest is normalised again."""
         height, width = self.panorama.is_valid.shape
         enlarged = cv2.resize(is_hidden.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
         rest = replace(self.panorama, is_valid=self.panorama.is_valid & (enlarged == 0))
@@ -106,34 +106,34 @@ class PhotoImages:
             images=Images(*(Once(Texels.mirror, image) for image in self.images)),
             small=small,
             seen=Once(find_seen, panorama, small),
-            shown=Once(find_cone, small, 0.0),
+            cone=Once(find_cone, small, 0.0),
             R_cam_from_level=MIRROR @ self.R_cam_from_level @ MIRROR,
         )
 
     def forget(self) -> "PhotoImages":
-        """Return the photo with its images as they are before they are asked for."""
+        """Return the photo without the images made so far, which are made again when they are needed."""
         return self.take(self.panorama)
 
     def take(self, panorama: Panorama) -> "PhotoImages":
-        """Return the photo of another panorama, by a camera of the same tilt."""
+        """Return another panorama as a photo at the same sizes, taken with the same tilt."""
         return make_photo(panorama, self.scales, self.R_cam_from_level, self.has_tilt)
 
 
 def make_photo(
     panorama: Panorama, scales: ImageScales, R_cam_from_level: Array, has_tilt: bool
 ) -> PhotoImages:
-    """Make the photo of a panorama, each of its images resized from the one before."""
+    """Make the photo of a panorama."""
     panorama = resize(panorama, scales.full.width)
-    least = reduce(panorama, scales.fine)
-    small = pack_texels(least.rgb, least.is_valid)
+    fine = reduce(panorama, scales.fine)
+    small = pack_texels(fine.rgb, fine.is_valid)
     seen = Once(find_seen, panorama, small)
     images = make_images(panorama, scales)
-    shown = Once(find_cone, small, 0.0)
-    return PhotoImages(panorama, images, small, seen, shown, R_cam_from_level, has_tilt, scales)
+    cone = Once(find_cone, small, 0.0)
+    return PhotoImages(panorama, images, small, seen, cone, R_cam_from_level, has_tilt, scales)
 
 
 def make_images(panorama: Panorama, scales: ImageScales) -> Images:
-    """Make the images of a panorama, each resized from the one before."""
+    """Make the images of a panorama, each from the next larger one."""
     images = {}
     larger = Once(lambda: panorama)
     for name, scale in scales._asdict().items():
@@ -143,12 +143,15 @@ def make_images(panorama: Panorama, scales: ImageScales) -> Images:
 
 
 def reduce(panorama: Panorama, scale: ImageScale) -> Panorama:
-    """Return a panorama at the size of one of its images, made of one that is wider or of the same size."""
+    """Blur a panorama as the scale says, and shrink it to the scale's width if it is wider."""
     return resize(soften(panorama, scale.blur_px) if scale.blur_px else panorama, scale.width)
 
 
 def find_seen(panorama: Panorama, small: Texels, workers: Workers) -> Seen:
-    """Find keypoints in one view around what a photo shows, or in several; of a whole photo to its sides."""
+    """Find the keypoints of a photo, in one view around what it shows or, if that is too wide, in several.
+
+    The views of a whole photo are those to its sides, without above and below.
+    """
     width = panorama.rgb.shape[1]
     around = view_around(find_valid(small), width / math.tau, width)
     several = list_sides(width) if small.valid_share >= LEAST_WHOLE else cover_sphere(width)
@@ -160,7 +163,7 @@ def find_seen(panorama: Panorama, small: Texels, workers: Workers) -> Seen:
 
 
 def find_all_around(photo: PhotoImages, workers: Workers) -> Keypoints:
-    """Find a photo's keypoints in all directions, of a whole one also above and below."""
+    """Find a photo's keypoints in all directions, for a whole photo also above and below."""
     if photo.is_partial:
         return photo.seen(workers).keypoints
     panorama = photo.panorama

@@ -1,4 +1,4 @@
-"""Prior knowledge of the user: it leaves fewer positions and rotations to search."""
+"""What the user knows of a photo's pose leaves fewer positions and rotations to search."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from ..system.arrays import Array, Mask
 
 
 def allow_by_option(scan_map: ScanMap, prior: Prior) -> dict[str, Mask]:
-    """Return the candidates (N,) that each option allows, with a margin of half a grid spacing."""
+    """Return the mask (N,) of candidates that each option allows, with a margin of half a grid spacing."""
     allowed: dict[str, Mask] = {}
     if prior.near is not None and prior.radius is not None:
         allowed["`near`"] = distances_to(scan_map, prior.near) <= prior.radius + COARSE_SPACING / 2
@@ -24,14 +24,14 @@ def allow_by_option(scan_map: ScanMap, prior: Prior) -> dict[str, Mask]:
 
 
 def ball_of(prior: Prior) -> Ball | None:
-    """Return the ball of the world in which the camera was; None if the prior does not say that."""
+    """Return the ball, in the world, in which the camera was; None if the prior names none with a z."""
     if prior.near is None or prior.near[2] is None or prior.radius is None:
         return None
     return Ball(np.array(prior.near, float), prior.radius)
 
 
 def distances_to(scan_map: ScanMap, near: tuple[float, float, float | None]) -> Array:
-    """Return the distance (N,) [m] of each candidate from a place; along the ground if it has no z."""
+    """Return the distance (N,) [m] of each candidate from a place of the world; horizontal if z is None."""
     x, y, z = near
     centers_world = scan_map.centers @ scan_map.R_map_from_world + scan_map.origin_world
     offsets = centers_world[:, :2] - (x, y) if z is None else centers_world - (x, y, z)
@@ -39,7 +39,7 @@ def distances_to(scan_map: ScanMap, near: tuple[float, float, float | None]) -> 
 
 
 def nothing_allowed(scan_map: ScanMap, prior: Prior) -> str:
-    """Return a warning that no candidate is left: how many each option allows, and the nearest one."""
+    """Return a warning that no candidate is left: how many each option allows, and the one nearest."""
     num = len(scan_map.centers)
     if num == 0:
         return "the scan: found no place for a camera (free space 0.3 to 2.4 m above a surface, closed in)"
@@ -54,7 +54,7 @@ def nothing_allowed(scan_map: ScanMap, prior: Prior) -> str:
 
 
 def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
-    """Return the map with only those cells of the coarse grid in which the prior allows a candidate."""
+    """Return the map with only those cells of the coarse grid where the prior allows a candidate."""
     is_allowed = np.ones(len(scan_map.centers), dtype=bool)
     for mask in allow_by_option(scan_map, prior).values():
         is_allowed &= mask
@@ -64,7 +64,10 @@ def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
 
 
 def allow_rotations(R_cam_from_world: Array, prior: Prior) -> Array:
-    """Return the rotations (N, 3, 3) of which the prior allows the heading, or else the nearest."""
+    """Return those of some rotations (N, 3, 3) whose heading the prior allows.
+
+    If it allows none, those with the nearest heading are returned. Rotations are from the world's axes.
+    """
     if prior.heading_deg is None:
         return R_cam_from_world
     off = heading_errors(R_cam_from_world, prior.heading_deg)

@@ -1,4 +1,4 @@
-"""A problem: where in a map was a photo taken? What is asked, and no more: steps hand on what they find."""
+"""A problem: where in a map was a photo taken? It holds the question only; each step hands its results on."""
 
 import math
 from dataclasses import dataclass, replace
@@ -26,53 +26,53 @@ from .profile import VIEWS, Profile, choose_profile, choose_scales
 from .stages import ViewName
 
 MAX_LOSS_WIDTH = 2048  # [px] of the photo for the loss: more costs time and gains nothing
-NUM_POINTS = 30_000  # of the last descent, among those that the photo shows
-AROUND_VOXEL_PER_RANGE = 1 / 150  # of points around a pose, with which the photo is compared
-COARSE_VOXEL_PER_RANGE = 1 / 40  # of coarser ones
+NUM_POINTS = 30_000  # points of the scan in the last descent, all where the photo shows them
+AROUND_VOXEL_PER_RANGE = 1 / 150  # largest voxel, divided by its distance, of the points around a pose
+COARSE_VOXEL_PER_RANGE = 1 / 40  # the same of the coarser points
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A photo, the map that it is searched in, and what is known about its pose."""
+    """A photo, the map in which it is searched, and what is known about its pose."""
 
     source: Panorama  # the photo as it was read
-    given: Panorama  # which is compared: the photo, or its edges if the scan has no colours
+    given: Panorama  # the picture that is compared: the photo, or its edges if the scan has no colours
     photo: PhotoImages
-    colors: Once[Texels]  # of what is given, at the size at which the loss is taken
-    scan_map: ScanMap  # of which the prior allows every candidate
-    views: RecentViews  # of the scan, drawn when they are asked for
+    colors: Once[Texels]  # of `given`, at the size at which the paper's loss is computed
+    scan_map: ScanMap  # searched only where the prior allows
+    views: RecentViews  # of the scan, each rendered when it is needed
     profile: Profile
     prior: Prior
     gravity: Gravity
-    rotations: Array | None = None  # (N, 3, 3) camera from map, searched in place of all
-    beside: tuple[Matches, ...] = ()  # with each of the photos beside this one whose poses are known
+    rotations: Array | None = None  # (N, 3, 3) camera from map: only these are searched; None: all
+    beside: tuple[Matches, ...] = ()  # one for each photo of known pose that shows the same
 
     @property
     def method(self) -> Method:
-        """The numbers by which it is decided."""
+        """The numbers by which the method decides."""
         return self.profile.method
 
     @property
     def pixel(self) -> float:
-        """Pixel [rad] of the photo as it was given, but none finer than those that are compared."""
+        """Angle [rad] of a pixel of the photo, or of its largest image if that is coarser."""
         width: int = min(self.given.rgb.shape[1], self.photo.panorama.rgb.shape[1])
         return math.tau / width
 
     def by_views(self) -> "Problem":
-        """Return the problem by whole views alone."""
+        """Return the problem with poses compared by whole views alone, without local features."""
         return replace(self, profile=self.profile.by_views())
 
     def show(self, photo: PhotoImages) -> "Problem":
-        """Return the problem with other images of the photo, as without what hides the scan."""
+        """Return the problem with other images of the photo, such as with occluders masked."""
         return replace(self, photo=photo)
 
     def forget(self) -> "Problem":
-        """Return the problem without images that were made: 100 MB less."""
+        """Return the problem without the images and views made so far, which frees about 100 MB."""
         colors = Once(make_texels, self.given)
         return replace(self, photo=self.photo.forget(), colors=colors, views=make_views(self.scan_map))
 
     def retake(self, panorama: Panorama) -> "Problem":
-        """Return the problem of the photo as another camera took it; what it shows may lie elsewhere."""
+        """Return the problem of the photo resampled by another calibration, which moves its content."""
         fresh = prepare_problem(panorama, self.scan_map, self.prior, self.gravity, self.method)
         return fresh if self.profile.uses_matches else fresh.by_views()
 
@@ -88,7 +88,10 @@ class Problem:
         )
 
     def view_at(self, pose: Pose, name: ViewName) -> Cells:
-        """Return the cells or points seen from a position near a pose, those that the photo shows."""
+        """Return the scan's cells or points that the photo, taken at a pose, shows.
+
+        They are rendered from a place that is at most half a grid spacing away (`round_position`).
+        """
         config = VIEWS[name]
         place = round_position(pose)
         shown = self.photo.find_shown_cells(config.num_rings, pose)
@@ -98,11 +101,14 @@ class Problem:
         return normalize_view(self.views.averages(place, config, cone), place, config, shown)
 
     def averages_at(self, pose: Pose, place: Place, config: ViewConfig) -> Array32:
-        """Return the sums (cells, 8) of a view from a place near a pose, of what the photo shows."""
+        """Return the sums (cells, 8) of the view from a place near a pose, as of `average_nodes`.
+
+        Only the cells that the photo, taken at the pose, shows are complete.
+        """
         return self.views.averages(place, config, self.photo.find_cone(config.num_rings, pose))
 
     def surroundings_at(self, pose: Pose) -> tuple[PackedPoints, PackedPoints]:
-        """Return the points around a pose with which the photo is compared, and coarser ones."""
+        """Return the scan's points in all directions around a pose, and coarser ones."""
         around = partial(self.views.surroundings, round_position(pose))
         return around(AROUND_VOXEL_PER_RANGE), around(COARSE_VOXEL_PER_RANGE)
 
@@ -114,7 +120,7 @@ def prepare_problem(
     gravity: Gravity = "auto",
     method: Method = METHOD,
 ) -> Problem:
-    """Prepare a panorama for the search where its prior allows; the photo may give the camera's tilt."""
+    """Prepare a panorama for its search in a map; its metadata may give the camera's tilt."""
     source = panorama
     R_level_from_cam = rotation_to_level(panorama.gpano) if panorama.gpano else None
     has_tilt = R_level_from_cam is not None
@@ -137,7 +143,7 @@ def prepare_problem(
 
 def make_views(scan_map: ScanMap) -> RecentViews:
     """Return the views of a map, none rendered yet."""
-    # leaves have narrow edges, which only the last descent is near enough to
+    # the octree's leaves have narrow edges: only the last descent begins near enough to use them
     averaged = scan_map.octree.without_leaves() if scan_map.has_shape else None
     return RecentViews(scan_map.octree, averaged)
 

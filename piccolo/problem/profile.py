@@ -10,18 +10,19 @@ from ..views.view import ViewConfig
 from .method import METHOD, Method
 from .stages import FIRST, SECOND, SOFT, ImageName, Stage, ViewName
 
-# the scan's shape; its coloured views; these, and local features of the scan drawn at the pose
+# by what a pose is judged: edges; views with colours; these and local features of the scan drawn there
 EvidenceKind = Literal["shape", "views", "drawn scan"]
-Tilts = Literal["known", "level", "any"]  # of the camera that are searched: its own, about level, all
+# tilts of the camera that a search tries: the known one (upright if none is), about level, all
+Tilts = Literal["known", "level", "any"]
 
 
 class Beam(NamedTuple):
-    """The number of poses that go on to each stage."""
+    """The numbers of poses that go on from stage to stage."""
 
     num_coarse: int  # after a short descent from each start
     num_middle: int  # after the descent on prepared views
     num_fine: int  # after the descent on middle cells
-    num_perturbed: int  # are perturbed and refined for as long as that helps
+    num_perturbed: int  # that are perturbed and refined as long as the score rises
 
 
 class ImageScale(NamedTuple):
@@ -29,12 +30,12 @@ class ImageScale(NamedTuple):
 
     width: int  # [px] a multiple of local_normalization's STATS_WIDTH
     cell_deg: float  # colours are averaged over cells this wide
-    sigma_deg: float  # of the Gaussian in which contrast is judged
-    blur_px: float = 0.0  # standard deviation, in the next wider image, with which that is blurred before
+    sigma_deg: float  # of the Gaussian over which contrast is normalised
+    blur_px: float = 0.0  # standard deviation of a blur before shrinking, in pixels of the wider image
 
 
 class ImageScales(NamedTuple):
-    """The sizes at which the panorama is compared, widest first: each is made from the one before."""
+    """The sizes at which the panorama is compared, widest first; each image is made from the one before."""
 
     full: ImageScale = ImageScale(1024, 0.0, 10.0)
     fine: ImageScale = ImageScale(256, 0.0, 10.0)
@@ -48,11 +49,11 @@ VIEWS: dict[ViewName, ViewConfig] = {  # from coarse to fine
     "fine": ViewConfig(num_rings=96, stats_rings=24, sigma_deg=10.0, voxel_per_range=1 / 80),
     "points": ViewConfig(num_rings=96, stats_rings=24, sigma_deg=10.0, voxel_per_range=1 / 150),
 }
-# edges drawn at a pose, as wide as those of the photo's fine image
+# of edges drawn at a pose, which are as wide as those of the photo's fine image
 DRAWN_VIEW = ViewConfig(
     num_rings=160, stats_rings=24, sigma_deg=10.0, voxel_per_range=1 / 150, draws_edges=True
 )
-# narrow edges are for the last descent: all others need them as wide as those of coarse voxels
+# the edges are blurred for all but the last descent, to be as wide as those of coarse voxels
 SHAPE_SCALES = ImageScales(fine=ImageScales().fine._replace(blur_px=1.7))
 
 
@@ -60,7 +61,7 @@ class DifferenceSteps(NamedTuple):
     """Image and step with which the loss is differentiated for a covariance."""
 
     image: ImageName  # of the photo
-    turn: float  # [rad] step of the differences; a move is this times the median range
+    turn: float  # [rad] step of rotations; that of translations is this times the median range
     inflation: float  # so that 95 % of true poses lie in the 95 % region (tools/benchmark.py calibration)
 
 
@@ -68,9 +69,9 @@ COLOR_STEPS = (
     DifferenceSteps("full", math.radians(0.1), 1.1),
     DifferenceSteps("fine", math.radians(0.3), 0.36),
 )
-# of dark, noisy photos; they are too few to calibrate
+# for dark, noisy photos; there are too few to calibrate its factor
 ROUGH_COLOR_STEPS = DifferenceSteps("middle", math.radians(0.3), 1.0)
-# of edges, whose poses have larger errors
+# for edges, by which poses have larger errors
 SHAPE_STEPS = (
     DifferenceSteps("full", math.radians(0.5), 1.0),
     DifferenceSteps("fine", math.radians(0.5), 1.0),
@@ -82,61 +83,61 @@ PARTIAL_BEAM = Beam(1600, 192, 12, 3)  # many places look like a part of the sph
 
 @dataclass(frozen=True)
 class Profile:
-    """A kind of photo: all in which kinds differ, by default as for a whole photo in a scan with colours.
+    """All that differs between kinds of photos. The defaults are for whole photos in scans with colours.
 
-    `of_part` and `by_shape` say what other kinds have instead.
+    `of_part` and `by_shape` list what differs for other kinds.
     """
 
-    method: Method = METHOD  # the numbers by which all kinds are decided
-    evidence: EvidenceKind = "drawn scan"  # with what poses are compared
+    method: Method = METHOD  # the numbers that all kinds have in common
+    evidence: EvidenceKind = "drawn scan"  # by what poses are judged
     is_partial: bool = False  # the photo shows a part of the sphere
-    is_narrow: bool = False  # views tell little: matches with the drawn scan, and photos beside, place it
+    is_narrow: bool = False  # whole views constrain its pose little: local features do
     # the search
-    follows_walls: bool = False  # its lines are turned along the walls of the scan, at one tilt after another
-    looks_first: bool = True  # unless its tilt is unknown, a brief look by whole views may settle it
-    is_always_upright: bool = False  # it is searched as upright too if its tilt is said to be unknown
-    default_tilt: Tilts = "known"  # how a photo of unknown tilt is searched: as upright, or about level
-    thins_starts: bool = True  # it has fewer starts where there are few candidates
+    follows_walls: bool = False  # its lines are aligned with the scan's walls, at several tilts
+    looks_first: bool = True  # a brief search by whole views is tried first, unless its tilt is unknown
+    is_always_upright: bool = False  # an upright camera is also tried if gravity is `unknown`
+    default_tilt: Tilts = "known"  # what is tried first if its tilt is unknown: upright, or about level
+    thins_starts: bool = True  # with few candidates, there are fewer starts
     starts_apart: Nearness = STARTING  # starts nearer to each other count as one
-    subtracts_means: bool = False  # of views and photo, from the correlation of wide cells
-    scores_again: bool = True  # its starts, on the cells of the search grid
+    subtracts_means: bool = False  # of views and photo, in the correlation on wide cells
+    scores_again: bool = True  # starts are ordered by scores on the fine cells of the search
     # the refinement
     beam: Beam = WHOLE_BEAM
-    first: Stage = FIRST  # of short descents from starts
-    refines_on_matches: bool = False  # the scan is drawn at all candidates; many matches add one
-    soft: tuple[Stage, ...] = ()  # descents on points before all others
-    settles_near: bool = False  # near a given pose it converges slowly: it goes on, without occluders
+    first: Stage = FIRST  # the short descent from each start
+    refines_on_matches: bool = False  # candidates with many matches are also refined on them
+    soft: tuple[Stage, ...] = ()  # stages before the first descent on points
+    settles_near: bool = False  # a descent near a given pose is slow: it goes on with occluders masked
     # the choice
-    clear_score: float = 0.3  # least score of one pose alone that explains a whole photo: see docs/METHOD.md
-    # alternatives at which the scan is drawn at most; None: all that could win. Of a whole photo it is drawn
-    # in four views for each, and further ones never won
+    clear_score: float = 0.3  # least score of a pose that explains the photo without matches
+    # largest number of alternatives at which the scan is drawn; None: all that could win. For a whole photo
+    # four views of the scan are drawn for each, and alternatives beyond these never won
     most_rivals: int | None = 4
-    discount: float = 1.0  # of scores by shape: of few blocks chance explains more
+    discount: float = 1.0  # factor of scores by shape: on few blocks chance explains more
     # geometry and errors
-    fits_sphere: bool = True  # what a panorama shows of the sphere is compared with the scan
-    steps: tuple[DifferenceSteps, ...] = COLOR_STEPS  # of a covariance, which is the mean by these
-    rough_steps: DifferenceSteps = ROUGH_COLOR_STEPS  # if all of these are too rough
-    own_share: float = 1.0  # of the variance by images: errors that other photos do not have in common
-    has_few_blocks: bool = False  # so that their covariance is too small in the mean
-    compares_halves: bool = True  # lenses stitched with an error: halves that disagree add to the covariance
+    fits_sphere: bool = True  # the part of the sphere that a panorama says to show is fitted to the scan
+    steps: tuple[DifferenceSteps, ...] = COLOR_STEPS  # the covariance is the mean of those by these
+    rough_steps: DifferenceSteps = ROUGH_COLOR_STEPS  # if the loss is too rough for all of these
+    own_share: float = 1.0  # of the variance by images that is this photo's own, not common to all
+    has_few_blocks: bool = False  # by which a covariance is too small in the mean: it is enlarged
+    compares_halves: bool = True  # a covariance grows if the halves of a badly stitched photo disagree
 
     @property
     def has_shape(self) -> bool:
-        """True if edges are compared: the scan has no colours."""
+        """True if edges are compared, as the scan has no colours."""
         return self.evidence == "shape"
 
     @property
     def uses_matches(self) -> bool:
-        """True if local features speak for poses, not whole views alone."""
+        """True if poses are judged by matches of local features too, not by whole views alone."""
         return self.evidence == "drawn scan"
 
     def by_views(self) -> "Profile":
-        """Return the profile by whole views alone; shape has no other."""
+        """Return the profile that judges poses by whole views alone; by shape it is always so."""
         return replace(self, evidence="views", is_narrow=False) if self.uses_matches else self
 
 
 def of_part(whole: Profile) -> Profile:
-    """Return the kind of photos of a part of the sphere: what they have other than whole ones."""
+    """Return the profile of photos that show a part of the sphere, from that of whole ones."""
     return replace(
         whole,
         is_partial=True,
@@ -149,7 +150,7 @@ def of_part(whole: Profile) -> Profile:
         subtracts_means=True,
         scores_again=False,
         beam=PARTIAL_BEAM,
-        first=SECOND,  # which needs more iterations
+        first=SECOND,  # a part of the sphere needs more iterations
         refines_on_matches=True,
         settles_near=True,
         most_rivals=None,
@@ -158,10 +159,10 @@ def of_part(whole: Profile) -> Profile:
     )
 
 
-def by_shape(seen: Profile) -> Profile:
-    """Return the kind of photos in scans without colours: what they have other than in those with."""
+def by_shape(by_colors: Profile) -> Profile:
+    """Return the profile of photos in scans without colours, from that in scans with colours."""
     return replace(
-        seen,
+        by_colors,
         evidence="shape",
         is_narrow=False,
         follows_walls=True,
@@ -171,7 +172,7 @@ def by_shape(seen: Profile) -> Profile:
         fits_sphere=False,
         steps=SHAPE_STEPS,
         rough_steps=ROUGH_SHAPE_STEPS,
-        own_share=0.05,  # chosen: edges of all photos lie beside those of the scan in the same way
+        own_share=0.05,  # chosen: the scan's edges are displaced from those of all photos alike
         compares_halves=False,
     )
 
@@ -182,12 +183,12 @@ PROFILES = (WHOLE, PARTIAL, by_shape(WHOLE), by_shape(PARTIAL))
 
 
 def choose_profile(valid_share: float, is_partial: bool, has_shape: bool, method: Method = METHOD) -> Profile:
-    """Return the profile of a photo that shows a share of the sphere, in a scan with colours or by shape."""
+    """Return the profile of a photo that shows a fraction of the sphere, `valid_share`."""
     kind = next(p for p in PROFILES if (p.is_partial, p.has_shape) == (is_partial, has_shape))
-    found = replace(kind, method=method)
-    return replace(found, discount=math.sqrt(valid_share)) if has_shape and is_partial else found
+    profile = replace(kind, method=method)
+    return replace(profile, discount=math.sqrt(valid_share)) if has_shape and is_partial else profile
 
 
 def choose_scales(has_shape: bool) -> ImageScales:
-    """Return the sizes at which a photo is compared, in a scan with colours or by shape."""
+    """Return the sizes at which a photo is compared; `has_shape` if the scan has no colours."""
     return SHAPE_SCALES if has_shape else ImageScales()

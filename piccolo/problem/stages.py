@@ -4,11 +4,11 @@ from typing import Literal, NamedTuple
 
 ViewName = Literal["prepared", "middle", "fine", "points"]
 ImageName = Literal["full", "fine", "middle", "search"]
-NEARLY = 0.02  # [m] after a smaller move the camera sees the same points
+NEARLY = 0.02  # [m] a camera that moved by less than this sees the same points
 
 
 class Limits(NamedTuple):
-    """The loss of a descent, and its end."""
+    """The scale of a descent's loss, and the limits at which it ends."""
 
     loss_scale: float  # [standard deviations]
     num_iterations: int  # at most
@@ -16,22 +16,22 @@ class Limits(NamedTuple):
 
 
 class Around(NamedTuple):
-    """Poses around the one that is given: each descends on a coarser image first, and the best end counts."""
+    """Perturbed poses around the given one: each descends on a coarser image first; the best end goes on."""
 
     image: ImageName
-    num_iterations: int  # on that
+    num_iterations: int  # on that image
     size: float  # of the perturbations, relative to `perturbed_distance` and `perturbed_angle` of the method
 
 
 class Rounds(NamedTuple):
-    """Repetitions of a descent, each on the points that are visible from the end of the one before."""
+    """Repetitions of a descent, each on the points visible from where the one before ended."""
 
     most: int
     arrived: float  # [m] a smaller move ends them
 
 
 class Stage(NamedTuple):
-    """A descent from a pose: on which view of the scan from there, and in which image of the photo."""
+    """A descent from a pose: the scan's view and the photo's image that are compared, and its limits."""
 
     view: ViewName
     image: ImageName
@@ -46,6 +46,6 @@ MIDDLE = Stage("middle", "middle", Limits(1.2, 12, 1e-3))
 AROUND_MIDDLE = Stage("middle", "middle", Limits(1.2, 8, 1e-3), Around("search", 6, 1.0))
 AROUND_FINE = Stage("fine", "fine", Limits(1.2, 8, 1e-3), Around("middle", 6, 0.4))
 FINE = Stage("fine", "fine", Limits(1.0, 12, 1e-4))
-SOFT = Stage("points", "fine", Limits(1.0, 12, 1e-4))  # of edges, before the next ones
+SOFT = Stage("points", "fine", Limits(1.0, 12, 1e-4))  # of edges, before the first descent on a finer image
 FULL = Stage("points", "full", Limits(0.7, 10, 1e-4), rounds=Rounds(2, NEARLY))
 LAST = Stage("points", "full", Limits(0.7, 30, 1e-7), rounds=Rounds(6, 1e-4))

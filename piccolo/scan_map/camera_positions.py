@@ -1,4 +1,4 @@
-"""Possible positions of a camera, in free space at its height above a surface, and walks between them."""
+"""Possible positions of a camera: free space at a camera's height above a surface; and paths between them."""
 
 import math
 import time
@@ -14,36 +14,35 @@ from ..system.errors import InputError
 from ..system.jobs.threads import Workers
 from ..views.view import VIEWS_A_TASK, ViewConfig, ranges_around
 
-MIN_CLEARANCE = 0.25  # [m] a camera is not nearer to a surface
-MIN_COVERAGE = 0.55  # fraction of the sphere that shows something: flat ground or a roof alone fills half
-OPEN_COVERAGE = 0.3  # the same where hardly any place is closed in: open land
-MIN_ENCLOSED = 0.2  # fraction of the free places that are closed in, else the land counts as open
+MIN_CLEARANCE = 0.25  # [m] from a camera to the nearest surface, at least
+MIN_COVERAGE = 0.55  # least fraction of the sphere with points: flat ground or a roof alone fills half
+OPEN_COVERAGE = 0.3  # the same in open land, where hardly any position reaches MIN_COVERAGE
+MIN_ENCLOSED = 0.2  # if a smaller fraction of positions reaches MIN_COVERAGE, the land is open
 FREE_SPACE_VIEW = ViewConfig(num_rings=12, stats_rings=12, sigma_deg=22.0, voxel_per_range=1 / 8)
 MIN_CAMERA_HEIGHT = 0.3  # [m] above a surface that can carry a tripod or a person
-MAX_CAMERA_HEIGHT = 2.4
-SUPPORT_RADIUS = 0.9  # [m] the floor right below a scanner is never scanned
-STOREY = 2.6  # [m] a floor is not farther below a camera
-SURFACE_VOXEL = 0.16  # [m]
-COARSE_SPACING = 0.6  # [m] of the grid; the half of it where surfaces are near
-CLEARANCE_VOXEL = 0.08  # [m]
+MAX_CAMERA_HEIGHT = 2.4  # [m]
+SUPPORT_RADIUS = 0.9  # [m] across to that surface: right below a scanner nothing is scanned
+STOREY = 2.6  # [m] from a camera down to its floor, at most
+SURFACE_VOXEL = 0.16  # [m] of the surfaces that can carry a camera
+COARSE_SPACING = 0.6  # [m] of the grid of positions; half of this near surfaces
+CLEARANCE_VOXEL = 0.08  # [m] of the points from which clearance is measured
 NEAR_SURFACE = 0.3  # [m] clearance below which the grid is refined
-MAX_POSITIONS = 250_000  # looked at, and views rendered: some ten minutes on two cores, 1.9 GB
+MAX_POSITIONS = 250_000  # at most: to test and to render so many takes ten minutes on two cores, 1.9 GB
 ADVICE = (
     "the most that are searched; if its unit is not the metre, set `units`, else say where the camera was "
     "(`near` and `radius`) or cut out a part"
 )
-BASES = 1 << 14  # cells on surfaces, around which others are supported, or centres, at a time
-LONG = 60.0  # [s] a warning says how long the views take, if more
-COST_OF_VIEW = 4.0  # time of a position's coverage and view, relative to its coverage
-GRID_REACH = (
-    math.sqrt(2.5) * COARSE_SPACING
-)  # [m] to neighbours in the grid: across edges (sqrt 2), not corners
-TUBE_RADIUS = MIN_CLEARANCE / 2.0  # [m] of a free way
-DETOUR = 1.0 / math.cos(math.pi / 8.0)  # paths along edges and across squares are at most so much longer
+BASES = 1 << 14  # cells of surfaces, or centres, that are processed at a time
+LONG = 60.0  # [s] a warning tells how long the preparation takes if it takes longer
+COST_OF_VIEW = 4.0  # time of a position's coverage and view, divided by that of its coverage alone
+# [m] to neighbours in the grid: those across edges (sqrt 2) count, those across corners (sqrt 3) do not
+GRID_REACH = math.sqrt(2.5) * COARSE_SPACING
+TUBE_RADIUS = MIN_CLEARANCE / 2.0  # [m] of the tube that must be free along a path
+DETOUR = 1.0 / math.cos(math.pi / 8.0)  # longest path in the grid, divided by the straight distance
 
 
 def top_surfaces(octree: Octree) -> Array32:
-    """Return the voxel means (N, 3) above which the next two voxels are empty."""
+    """Return the mean points (N, 3) [m] of the voxels above which two voxels are empty."""
     xyz = octree.level(SURFACE_VOXEL)[:, :3]
     ijk = np.floor(xyz / SURFACE_VOXEL).astype(np.int64)
     ijk -= ijk.min(axis=0) - 1
@@ -54,7 +53,7 @@ def top_surfaces(octree: Octree) -> Array32:
 
 
 class Ball(NamedTuple):
-    """Points within a radius [m] of a place (3,)."""
+    """Points within a radius [m] of a centre (3,) [m]."""
 
     center: Array
     radius: float
@@ -79,17 +78,18 @@ class Box(NamedTuple):
 
 
 class TooManyPositionsError(InputError):
-    """A scan of land, or in another unit: it has more camera positions than are searched."""
+    """The scan has too many camera positions: it is of open land, or its unit is not the metre."""
 
-    def __init__(self, what: str) -> None:
-        super().__init__(f"the scan: {what} leave more than {MAX_POSITIONS} camera positions, {ADVICE}")
+    def __init__(self, cause: str) -> None:
+        super().__init__(f"the scan: {cause} leave more than {MAX_POSITIONS} camera positions, {ADVICE}")
 
 
 def find_supported_cells(surfaces: Array32, within: Ball | Box | None = None) -> Int64s:
-    """Return cells (N, 3) of the coarse grid with centres at a camera's height above a surface (M, 3).
+    """Return the cells (N, 3) of the coarse grid whose centres are at a camera's height above a surface.
 
-    Only cells `within` a part of the scan are returned, with a margin of a grid spacing.
-    TooManyPositionsError if they are more than MAX_POSITIONS; memory is allocated for no more.
+    `surfaces` (M, 3) [m] are points of these surfaces. Only cells `within` a part of the scan are returned,
+    with a margin of a grid spacing. Raise TooManyPositionsError if there are more than MAX_POSITIONS; memory
+    is allocated for no more.
     """
     s = COARSE_SPACING
     reach = int(np.ceil(SUPPORT_RADIUS / s))
@@ -106,7 +106,7 @@ def find_supported_cells(surfaces: Array32, within: Ball | Box | None = None) ->
     steps = steps[np.hypot(gap[:, 0], gap[:, 1]) < SUPPORT_RADIUS]
     low = base.min(axis=0) - reach
     shape = base.max(axis=0) - low + reach + len(layers)
-    weights = np.array([shape[1] * shape[2], shape[2], 1])  # one number a cell sorts as its three do
+    weights = np.array([shape[1] * shape[2], shape[2], 1])  # one number for a cell, in the order of its three
     codes = np.unique((base - low) @ weights)
     found = np.empty(0, np.int64)
     for begin in range(0, len(codes), BASES):
@@ -122,7 +122,10 @@ def find_supported_cells(surfaces: Array32, within: Ball | Box | None = None) ->
 
 
 def coverage(octree: Octree, centers: Floats, workers: Workers) -> Array:
-    """Return the filled fraction of the sphere (N,) around each centre (N, 3), at a low resolution."""
+    """Return the fraction (N,) of the sphere around each centre (N, 3) [m] in which points are seen.
+
+    The resolution is low (FREE_SPACE_VIEW).
+    """
     area = whole_areas(FREE_SPACE_VIEW.num_rings).astype(np.int64)
 
     def glance(lo: int) -> Array:
@@ -136,19 +139,19 @@ def coverage(octree: Octree, centers: Floats, workers: Workers) -> Array:
 def nearest_distances(tree: Any, centers: Floats, workers: Workers) -> Array:
     """Return the distance (N,) [m] of each centre (N, 3) from the nearest point of a cKDTree.
 
-    It uses own threads: if a signal ends the work, the tree's threads would go on running in freed memory.
+    The threads are those of `Workers`: the tree's own would go on in freed memory if a signal ended the work.
     """
     begins = range(0, len(centers), BASES)
-    alone = Workers(workers.num_threads)  # too short a work to be shown
+    alone = Workers(workers.num_threads)  # without progress: the work is too short to show it
     parts = alone.map(lambda lo: tree.query(centers[lo : lo + BASES])[0], begins, "")
     return np.concatenate([np.empty(0), *parts])
 
 
 def warn_if_long(octree: Octree, centers: Floats, workers: Workers) -> None:
-    """Estimate from a sample the time to render views from the centres (N, 3); warn if it is long."""
+    """Estimate from a sample how long coverage and views of the centres (N, 3) take; warn if it is long."""
     sample = centers[:: 1 + len(centers) // VIEWS_A_TASK]
     alone = Workers()
-    coverage(octree, sample[:1], alone)  # compiled
+    coverage(octree, sample[:1], alone)  # compiles the kernels
     begin = time.perf_counter()
     coverage(octree, sample, alone)
     seconds = (time.perf_counter() - begin) / max(len(sample), 1) * len(centers) * COST_OF_VIEW
@@ -158,11 +161,11 @@ def warn_if_long(octree: Octree, centers: Floats, workers: Workers) -> None:
 
 
 def candidate_centers(octree: Octree, workers: Workers, within: Ball | Box | None = None) -> Array:
-    """Find positions (N, 3) [m] in free space, 0.6 m apart, or 0.3 m where surfaces are near.
+    """Find positions (N, 3) [m] in free space, 0.6 m apart, or 0.3 m near surfaces.
 
-    `within` and TooManyPositionsError are as of `find_supported_cells`.
+    `within` and TooManyPositionsError are as in `find_supported_cells`.
     """
-    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # imported only when a scan is prepared
 
     cells = find_supported_cells(top_surfaces(octree), within)
     points = octree.level(CLEARANCE_VOXEL)[:, :3]
@@ -181,7 +184,7 @@ def candidate_centers(octree: Octree, workers: Workers, within: Ball | Box | Non
     is_tight = (clearance < NEAR_SURFACE) & (is_enclosed | ~is_free)
     kept = middle[~is_tight & is_free & is_enclosed]
 
-    # Nothing of a cell is free if its centre is deeper in a surface than the cell is wide.
+    # Cells are split if their corners may be clear; with these constants those of all cells may.
     half = COARSE_SPACING / 2
     corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
     is_split = is_tight & (clearance + 0.87 * COARSE_SPACING > MIN_CLEARANCE)
@@ -195,11 +198,11 @@ def candidate_centers(octree: Octree, workers: Workers, within: Ball | Box | Non
 
 
 def heights_above_floor(octree: Octree, centers: Array) -> Array:
-    """Return heights (N,) [m] of centres (N, 3) above the floor: the lowest surface below in their storey.
+    """Return the heights (N,) [m] of centres (N, 3) above their floors, the lowest surface below each.
 
-    inf if there is none within SUPPORT_RADIUS and STOREY.
+    Surfaces within SUPPORT_RADIUS horizontally and STOREY vertically count; the height is inf without any.
     """
-    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # imported only when heights are needed
 
     surfaces = top_surfaces(octree)
     near = cKDTree(surfaces[:, :2]).query_ball_point(centers[:, :2], SUPPORT_RADIUS)
@@ -211,7 +214,7 @@ def heights_above_floor(octree: Octree, centers: Array) -> Array:
 
 
 class FreeSpace:
-    """A map's candidates (N, 3) [m] as a graph, with edges between neighbours along free ways."""
+    """A map's candidates (N, 3) [m] as a graph, with edges between neighbours joined by a free path."""
 
     def __init__(self, octree: Octree, centers: Array, workers: Workers) -> None:
         self.octree = octree
@@ -219,12 +222,12 @@ class FreeSpace:
         self.workers = workers
 
     def prepare(self) -> None:
-        """Build the graph, a second of work in a large building, before somebody waits for a distance."""
+        """Build the graph now, not at the first distance: in a large building it takes a second."""
         _ = self._graph
 
     @cached_property
     def _tree(self) -> Any:
-        from scipy.spatial import cKDTree  # noqa: PLC0415  # only walks wait for it
+        from scipy.spatial import cKDTree  # noqa: PLC0415  # imported only for walks
 
         return cKDTree(self.centers)
 
@@ -232,9 +235,9 @@ class FreeSpace:
     def _graph(self) -> Any:
         """Sparse matrix (candidates, candidates) of the edges' lengths [m].
 
-        A way is free if a tube around it fits into the empty balls around its ends and its middle.
+        A straight path is free if a tube around it fits into the empty balls around its ends and its middle.
         """
-        from scipy.sparse import coo_matrix  # noqa: PLC0415  # only walks wait for it
+        from scipy.sparse import coo_matrix  # noqa: PLC0415  # imported only for walks
         from scipy.spatial import cKDTree  # noqa: PLC0415
 
         centers = self.centers
@@ -242,7 +245,7 @@ class FreeSpace:
         surfaces = cKDTree(points, balanced_tree=False, compact_nodes=False)
 
         def covered(places: Array) -> Array:
-            """Return half the length (N,) [m] of the longest tube in the ball around each place (N, 3)."""
+            """Return half the length (N,) [m] of the longest tube in the empty ball at each place (N, 3)."""
             distance = nearest_distances(surfaces, places, self.workers)
             return np.sqrt(np.maximum(distance**2 - TUBE_RADIUS**2, 0.0))
 
@@ -256,11 +259,15 @@ class FreeSpace:
         return (one_way + one_way.T).tocsr()
 
     def distances(self, starts: Array, ends: Array, limit: float) -> Array:
-        """Return distances (S, N) [m] from places (S, 3) to others (N, 3) in the map; inf beyond a limit."""
+        """Return walking distances (S, N) [m] from starts (S, 3) to ends (N, 3) [m]; inf beyond a limit.
+
+        A distance is a lower bound: the straight one, or the path between the nearest candidates, less what a
+        path in the grid may be longer.
+        """
         from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
 
         straight = np.linalg.norm(ends[None] - starts[:, None], axis=2)
-        walked = straight.copy()  # nothing is between places so near that both keep clear of it
+        walked = straight.copy()  # nearby places have no surface between them: both keep clear of it
         far = (straight > 2.0 * MIN_CLEARANCE) & (straight <= limit)
         rows = np.flatnonzero(far.any(axis=1))
         if len(rows):
@@ -276,6 +283,6 @@ class FreeSpace:
         return np.asarray(walked)
 
     def fraction_within(self, center: Array, radius: float) -> float:
-        """Return the fraction of candidates within a radius [m] of a place (3,), counting at least one."""
+        """Return the fraction of candidates within a radius [m] of a place (3,) [m]; one at least counts."""
         near = self._tree.query_ball_point(center, radius, return_length=True)
         return max(int(near), 1) / max(len(self.centers), 1)

@@ -1,11 +1,11 @@
-"""A prepared map on disk: a NumPy archive, mapped into memory if no other process can truncate it meanwhile.
+"""A prepared map on disk: a NumPy archive, mapped into memory unless another process may truncate it.
 
-A file of another format, or damaged in any byte (each member of an archive has a checksum), is refused. A map
-may come from anybody, and checksums are easily recomputed: every index that a kernel takes from it is
-checked, every number bounded, and the octree compared with the grid of its voxels. The identity of a checked
-file is remembered.
-FORMAT changes with the meaning of the arrays, so that a file outlives an update; the cache also knows the
-sources by which a map was made, and makes it again when they have changed.
+A file of another format is refused, and so is one damaged in any byte, as each member of the archive has a
+checksum. A map may come from anybody, who can compute checksums too. So every index that a kernel takes from
+a map is checked, every number is bounded, and the octree is compared with the grid of its voxels. A checked
+file is remembered, and not checked again.
+FORMAT changes only with the names, types or meaning of the arrays, so that map files remain valid after other
+updates. The cache also compares the sources that make maps, and prepares a map again when they have changed.
 """
 
 import math
@@ -47,7 +47,7 @@ from .scan_map import MAX_SCANS, ScanMap, is_name, sparse_candidates
 
 Arrays = dict[str, Values]
 WIDE_CELLS = len(make_grid(WIDE_RINGS))
-# Type and shape; an axis that has a name is as long as the others of that name.
+# Type and shape of each array. All axes of the same name have the same length.
 LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "octree_nodes": ("<f4", ("nodes", 6)),
     "octree_first_child": ("<i4", ("links",)),
@@ -67,18 +67,19 @@ LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "crs": ("|u1", ("characters",)),  # UTF-8
 }
 SHA256 = re.compile("[0-9a-f]{64}")
-ROTATION_ROUNDING = 1e-9  # of a rotation
+ROTATION_ROUNDING = 1e-9  # largest error of the elements of a rotation or variance
 LEAF_SIZES = 1e-3, 0.1  # [m] least and most
-FARTHEST_ORIGIN = 1e12  # [m] of the world
-VOXEL_MARGIN = 10.0  # [m] around the voxels that are kept
-BRIGHTEST_COLOR = np.float32(1.0 + 1e-6)
+FARTHEST_ORIGIN = 1e12  # [m] largest coordinate of the map's origin in the world
+VOXEL_MARGIN = 10.0  # [m] that points may lie beyond the voxels' window
+BRIGHTEST_COLOR = np.float32(1.0 + 1e-6)  # 1 and rounding
 LARGEST_DEVIATION = 1.0  # [m] of points from their surfaces
-FARTHEST_LAYERS = 0.2, 1.0  # [rad] and [m] about and along any axis
+FARTHEST_LAYERS = 0.2, 1.0  # largest turn [rad] and move [m] between layers, by axis
 MAX_CRS = 4 * 20_000  # [byte]
 MAX_WARNINGS = 1000  # lines
 MAX_WARNING = 5000  # characters of a line
 FORMAT = "piccolo-map/11"
-NAME = own_names("piccolo-map")  # in a cache
+NAME = own_names("piccolo-map")  # pattern of file names in a cache
+# fields of ScanMap that are not stored as one array of the same name
 OTHERS = ("octree", "scan_names", "warnings", "crs", "is_partial", "views", "places")
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
 MEMBERS = {*LAYOUT, "format", "scan_names", "warnings"}
@@ -100,7 +101,7 @@ def first_misplaced(
 ) -> int:
     """Return the first node outside its parent's voxel, beyond `reach` [m] or without valid colour, or -1.
 
-    The links must be valid. `origin` (3,) is the vector from a corner of all levels' grids to zero [m].
+    The child links must be valid. `origin` (3,) [m] is the map's origin in the grid that all levels share.
     """
     num_levels = len(level_start) - 1
     for node in range(len(nodes)):
@@ -120,7 +121,7 @@ def first_misplaced(
 
 
 def check_arrays(path: Path, arrays: Arrays) -> None:
-    """Refuse arrays of a map file that `save_map` can't have written; the warnings are not checked."""
+    """Refuse arrays that `save_map` can't have written; the warnings of the map are not checked here."""
     sizes: dict[str, int] = {}
     for name, (dtype, shape) in LAYOUT.items():
         found = arrays[name]
@@ -146,12 +147,12 @@ def _refuse(path: Path, found: str) -> None:
 
 
 def _reach(arrays: Arrays) -> float:
-    """Return the largest distance [m] of points in a map from the origin along an axis."""
+    """Return the largest coordinate [m] that a point of a map may have."""
     return WINDOW * float(arrays["octree_leaf_size"]) + VOXEL_MARGIN
 
 
 def _check_frame(path: Path, arrays: Arrays) -> None:
-    """Check the rotation and the variance, and that the origin is at whole metres of the map's axes."""
+    """Check rotation and variance, and that the origin has whole metres along the map's axes."""
     R = check_rotation(arrays["R_map_from_world"], ROTATION_ROUNDING, f"{path}: R_map_from_world of the map")
     origin: Array = arrays["origin_world"]
     if not (np.abs(origin).max() < FARTHEST_ORIGIN and np.abs(R @ origin - np.rint(R @ origin)).max() < 1e-3):
@@ -163,9 +164,9 @@ def _check_frame(path: Path, arrays: Arrays) -> None:
 
 
 def _check_octree(path: Path, arrays: Arrays) -> None:
-    """Check that the children of each level are the next level, one to eight a node, within its voxel.
+    """Check the octree: each node above the leaves has one to eight children, all within its voxel.
 
-    And that the layers of surfaces are not far apart.
+    The children of a level must be the next level. The layers of surfaces must not be far apart.
     """
     nodes = arrays["octree_nodes"]
     first_child = arrays["octree_first_child"]
@@ -191,7 +192,7 @@ def _check_octree(path: Path, arrays: Arrays) -> None:
 
 
 def _check_views(path: Path, arrays: Arrays) -> None:
-    """Check that candidates are within the scan, with values in range, and sparse ones of the coarse grid."""
+    """Check that candidates lie in the scan, that views have valid levels, and that `sparse` is right."""
     if not np.abs(arrays["centers"]).max(initial=0.0) <= _reach(arrays):
         _refuse(path, "a candidate at no finite place or too far away")
     for name, (dtype, _) in LAYOUT.items():
@@ -202,7 +203,7 @@ def _check_views(path: Path, arrays: Arrays) -> None:
 
 
 def _check_scans(path: Path, arrays: Arrays) -> None:
-    """Check that names are text and distinct, and that each candidate lies in a named scan."""
+    """Check that the scans' names are valid and distinct, and that each candidate is in one of them."""
     found = arrays["scan_names"]
     index = arrays["scan_of_candidate"]
     if found.dtype.kind != "U" or found.ndim != 1 or len(found) > MAX_SCANS:
@@ -215,7 +216,7 @@ def _check_scans(path: Path, arrays: Arrays) -> None:
 
 
 def clean_warnings(path: Path, warnings: Values) -> tuple[str, ...]:
-    """Return printable warnings: without control characters, limited in number and length."""
+    """Return the warnings of a map without control characters, limited in number and length."""
     if warnings.dtype.kind != "U" or warnings.ndim != 1:
         _refuse(path, f"warnings of type {warnings.dtype} and shape {warnings.shape}")
     lines = (str(line)[:MAX_WARNING] for line in warnings[:MAX_WARNINGS])
@@ -238,24 +239,25 @@ def save_map(scan_map: ScanMap, path: Path) -> None:
 
 
 def is_map_file(path: Path) -> bool:
-    """Return True if the file begins as `save_map` writes it, in any version; clouds may be archives too.
+    """Return True if the file begins as a map of any version does; clouds may be NumPy archives too.
 
-    The first member's name or value is enough, so that a damaged map is still refused as a map.
+    The first member's name or its value is enough: a damaged map must still be refused as a map.
     """
     with path.open("rb") as file:
         head = file.read(512)
-    has_name = head.startswith(b"format.npy", 30)  # behind its header
+    has_name = head.startswith(b"format.npy", 30)  # after the 30 bytes of the member's header
     has_value = FORMAT.partition("/")[0].encode("utf-32-le") in head
     return head.startswith(b"PK\x03\x04") and (has_name or has_value)
 
 
 @contextmanager
 def hold_unchanged(path: Path, is_copied: bool) -> Iterator[Path | None]:
-    """Provide a map's file that may be mapped: itself, or a copy in the user's cache; else None.
+    """Provide a file of a map that can safely be mapped: the map itself, a copy in the user's cache, or None.
 
-    A file in the cache, where only the user may write, is only ever replaced whole. Any other may be
-    truncated or overwritten in place at any time, which would kill, or mislead, a process that has mapped it.
-    A copy in which the caller finds damage is removed. On Windows no file that is mapped could be replaced.
+    A file in the cache is only ever replaced as a whole, and only the user can write there. Any other file
+    may be truncated or overwritten at any time, which would kill or mislead a process that has mapped it. It
+    is copied if `is_copied`. If the caller raises an exception, such as for damage, the copy is removed. On
+    Windows the result is None: a mapped file could not be replaced.
     """
     if IS_WINDOWS:
         yield None
@@ -274,23 +276,23 @@ def hold_unchanged(path: Path, is_copied: bool) -> Iterator[Path | None]:
 
 
 def copy_into(path: Path, folder: Path) -> Path | None:
-    """Copy a file into a folder unless its current copy is there; None if that fails."""
+    """Copy a file into a folder unless it has a current copy; return the copy, or None if that fails."""
     with path.open("rb") as file:
         copy = folder / f"{make_key('copy', os.fstat(file.fileno()))}.piccolo-map"
         try:
             if not copy.exists():
                 with replacing(copy) as out:
                     shutil.copyfileobj(file, out, 1 << 22)
-        except OSError:  # as where the disk is full: it is read instead
+        except OSError:  # such as a full disk: the caller reads the file instead
             return None
     mark_used(copy)
     return copy
 
 
 def load_map(path: Path, remembers: bool = False) -> ScanMap:
-    """Read a map that `save_map` wrote, or map it into memory; InputError for any other file.
+    """Read a map that `save_map` wrote, or map it into memory. Raise InputError for any other file.
 
-    All of it is read and checked; with `remembers` only once, as long as the file is unchanged.
+    The whole file is read and checked. With `remembers` an unchanged file is checked only once.
     """
     what = f"checked as {FORMAT} by {__version__}"
     with naming_damage(path, WANTED), hold_unchanged(path, remembers) as place:

@@ -1,4 +1,4 @@
-"""The map of a cloud: from a prepared file, from the cache, or built now."""
+"""The map of a cloud: read from a prepared file, read from the cache, or prepared now."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -28,16 +28,16 @@ from .scan_addition import add_scan
 from .scan_map import ScanMap, name_scan, prepare_map
 
 FOLDER = "piccolo-maps"  # within the folder that the user names
-# What makes a map: folders of the package. The cache makes maps anew when one of their files has changed.
+# Folders of the package whose code makes a map. When one of their files has changed, maps are prepared anew.
 MAKERS = ("cloud", "geometry", "local_features", "photo/panorama", "scan_map", "views")
 
 
 @dataclass(frozen=True)
 class CachePolicy:
-    """The place of prepared maps."""
+    """Whether prepared maps are kept in a cache, and where."""
 
     is_used: bool = True
-    folder: Path | None = None  # None for the user's cache
+    folder: Path | None = None  # that the user names; None: the user's cache
 
 
 def open_map(
@@ -48,10 +48,10 @@ def open_map(
     watch: Stopwatch,
     part: Ball | None = None,
 ) -> ScanMap:
-    """Return the map of a cloud's files: prepared already, from the cache, or built now.
+    """Return the map of a cloud's files, from the cache or prepared now; or read a prepared map.
 
-    `paths` may be a prepared map instead of a cloud. A part of the world is prepared only if the scan is
-    too large as a whole.
+    `paths` may be a single prepared map instead of a cloud's files. `part`, a ball of the world, is used only
+    if the scan is too large as a whole: then only that part is prepared.
     """
     map_path = find_prepared_map(paths)
     if map_path:
@@ -62,7 +62,7 @@ def open_map(
             return load_map(map_path, cache.is_used)
 
     digest = ""
-    if all(path.is_file() for path in paths):  # what is none is refused when it is opened
+    if all(path.is_file() for path in paths):  # others are refused when the cloud is opened
         with watch.stage("read"):
             digest = sha256_of_files(paths, cache.is_used)
 
@@ -84,7 +84,7 @@ def open_map(
 
 
 def write_map(scan_map: ScanMap, path: Path) -> None:
-    """Write a map; InputError if it covers only a part of a scan."""
+    """Write a map to a file. Raise InputError if it covers only a part of a scan."""
     if scan_map.is_partial:
         raise InputError(f"{path}: found a map prepared within `near` only, wanted a whole map")
     save_map(scan_map, path)
@@ -98,7 +98,10 @@ def extend_map(
     workers: Workers,
     watch: Stopwatch,
 ) -> ScanMap:
-    """Return a prepared map with another scan added; a scan without a name is named after the map's file."""
+    """Return a prepared map with another scan added, called `name`.
+
+    If the map's own scan has no name, it is named after the map's file.
+    """
     if not find_prepared_map([map_path]):
         found = "no prepared map" if map_path.exists() else "no such file"
         raise InputError(f"{map_path}: found {found}, wanted a map of tools/prepare_map.py")
@@ -122,7 +125,7 @@ def extend_map(
 
 
 def find_prepared_map(paths: Sequence[Path]) -> Path | None:
-    """Return the first of some files that is a prepared map; None if there is none."""
+    """Return the first of some files that is a prepared map, or None."""
     return next((path for path in paths if path.is_file() and is_map_file(path)), None)
 
 
@@ -135,9 +138,10 @@ def scan_sha256_of(paths: Sequence[Path], cache: CachePolicy) -> str:
 
 
 def content_key(scan_sha256: str, settings: CloudSettings) -> str:
-    """Return the cache's name for a map: it depends on the files' contents and the settings, not on paths.
+    """Return the name of a map in the cache, by the contents of the scan's files and the settings.
 
-    And on whether pyproj is there, which knows the units of coordinate systems.
+    It also depends on the map's format, the code that makes maps, and whether pyproj is installed, which
+    knows the units of coordinate systems; not on paths.
     """
     has_pyproj = str(find_spec("pyproj") is not None)
     parts = [FORMAT, digest_of_sources(MAKERS), repr(replace(settings, crs=None)), has_pyproj, scan_sha256]
@@ -147,11 +151,11 @@ def content_key(scan_sha256: str, settings: CloudSettings) -> str:
 def open_cached_map(
     folder: Path | None, key: str, scan_sha256: str, build: Callable[[], ScanMap], watch: Stopwatch
 ) -> tuple[ScanMap, str]:
-    """Return a map from the cache, or build it and keep it there; and a warning of one line, or "".
+    """Return a map from the cache, or build it and keep it there; with a warning of one line, or "".
 
-    The cache is in `folder`, or the user's if that is None. With a warning of a failing cache the map is
-    valid, but not kept. Two processes may build one map at once: each writes its own file whole, and both are
-    equal.
+    The cache is in `folder`, or the user's if that is None. If the cache fails, the warning says so, and the
+    map is returned but may not be kept. Two processes may build the same map at once: each writes the whole
+    file, and both files are equal.
     """
     warning = ""
     try:
@@ -180,7 +184,7 @@ def open_cached_map(
 
 
 def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers) -> LocalCloud:
-    """Return all points of a cloud's files, or the voxels of a prepared map."""
+    """Return all points of a cloud's files, or the finest voxels of a prepared map, in the map's frame."""
     if find_prepared_map(paths):
         m = open_map(paths, settings, CachePolicy(is_used=False), workers, Stopwatch())
         return LocalCloud(m.R_map_from_world, m.origin_world, m.points, m.warnings)

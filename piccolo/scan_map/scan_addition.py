@@ -1,7 +1,7 @@
-"""Addition of another scan to a map: only changed parts are prepared again.
+"""Addition of another scan to a map: only what it changes is prepared again.
 
-Candidates stay at their positions. Views and local features that show the new scan are made again; all others
-keep every bit.
+Candidates stay at their positions, unless the new scan fills them. Views that show the new scan are rendered
+again; all others keep every bit.
 """
 
 from dataclasses import replace
@@ -23,32 +23,29 @@ from .camera_positions import CLEARANCE_VOXEL, MIN_CLEARANCE, Box, candidate_cen
 from .drawn_places import DrawnPlaces
 from .scan_map import ScanMap, check_name, look_for_layers, sparse_candidates
 
-BESIDE_SCAN = 3.0  # [m] beside the new scan there may be new places for a camera
-NEARER = 0.9  # of two scans the one in front is nearer by this
-# Fractions of the sphere in which a view shows the new scan, else it stays, or its features do: what they
-# miss, new views have from nearer.
-LEAST_CHANGED = 0.01
-LEAST_FOR_FEATURES = 0.1
-FAR_APART = 500.0  # [m] between scans that perhaps have no common coordinates
-COARSE_VOXEL = 2.56  # [m]
+BESIDE_SCAN = 3.0  # [m] up to here around the new scan there may be new candidates
+NEARER = 0.9  # a scan is in front of another if its range is less than this times the other's
+LEAST_CHANGED = 0.01  # of the sphere: a view that shows less of the new scan stays as it is
+FAR_APART = 500.0  # [m] scans farther apart may not have the same coordinate system: a warning says so
+COARSE_VOXEL = 2.56  # [m] by which the extent of a map is found
 
 
 class Candidates(NamedTuple):
-    """Candidates of a map and a new scan: the map's own that stay, then new ones."""
+    """The N candidates of a map and a new scan: first the S of the map that stay, then new ones."""
 
-    rows: Int64s  # (S,) of the map's candidates, those that stay
+    rows: Int64s  # (S,) indices, among the map's candidates, of those that stay
     centers: Array  # (N, 3) [m]
-    fraction: Array  # (N,) of the sphere in which the new scan is in front; of new ones 1
-    is_new: Mask  # (N,) more of the sphere shows the new scan in front than the others
+    fraction: Array  # (N,) of the sphere in which the new scan is in front; 1 for new candidates
+    is_new: Mask  # (N,) the new scan is in front of the others in more of the sphere than behind them
 
     @property
     def rows_to_render(self) -> Int64s:
-        """Indices of the candidates whose views must be made again."""
+        """Indices of the candidates whose views must be rendered, as they show the new scan."""
         return np.flatnonzero(self.fraction > LEAST_CHANGED)
 
 
 def add_scan(old: ScanMap, cloud: CloudStream, name: str, workers: Workers, watch: Stopwatch) -> ScanMap:
-    """Add another scan in the same coordinates to a map, under a name of its own."""
+    """Add another scan in the map's coordinate system to the map, under a name of its own."""
     check_name(name, old.scan_names)
     with watch.stage("read"):
         new, warnings = read_added_scan(old, cloud)
@@ -79,7 +76,7 @@ def add_scan(old: ScanMap, cloud: CloudStream, name: str, workers: Workers, watc
 
 
 def read_added_scan(old: ScanMap, cloud: CloudStream) -> tuple[Octree, tuple[str, ...]]:
-    """Read a scan into an octree of its own, in the map's frame; with warnings."""
+    """Read a scan into an octree of its own, in the map's frame; return it with warnings."""
     if old.octree.leaf_size != LEAF_SIZE:
         found = f"found a map of voxels of {old.octree.leaf_size} m"
         raise InputError(f"`add`: {found}, wanted {LEAF_SIZE} m; prepare it again")
@@ -99,8 +96,11 @@ def read_added_scan(old: ScanMap, cloud: CloudStream) -> tuple[Octree, tuple[str
 
 
 def join_candidates(old: ScanMap, new: Octree, octree: Octree, workers: Workers) -> Candidates:
-    """Join the candidates of a map and a new scan, by the octrees of the new one alone and of both."""
-    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
+    """Join the candidates of a map and of a new scan.
+
+    `new` is the octree of the new scan alone, `octree` that of both.
+    """
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # imported only when a scan is added
 
     points = new.level(CLEARANCE_VOXEL)[:, :3]
     clearance, _ = cKDTree(points).query(old.centers, distance_upper_bound=2.0 * MIN_CLEARANCE)
@@ -120,9 +120,10 @@ def join_candidates(old: ScanMap, new: Octree, octree: Octree, workers: Workers)
 
 
 def bound_sphere_fraction(box: Box, centers: Array) -> Array:
-    """Bound the fraction (N,) of the sphere that a box covers around centres (N, 3), by a ball around it.
+    """Return an upper bound of the fraction (N,) of the sphere around centres (N, 3) [m] that a box covers.
 
-    The bound is half for a centre in the ball, where the fraction may be larger.
+    It is the fraction that a ball around the box covers. For a centre in the ball it is half, although the
+    box may cover more there.
     """
     radius = 0.5 * float(np.linalg.norm(box.high - box.low))
     distance = np.linalg.norm(centers - 0.5 * (box.low + box.high), axis=1)
@@ -131,7 +132,10 @@ def bound_sphere_fraction(box: Box, centers: Array) -> Array:
 
 
 def compare_ranges(new: Octree, old: Octree, centers: Array, workers: Workers) -> tuple[Array, Array]:
-    """Return fractions (N,) of the sphere around centres (N, 3) where a new scan is in front, and behind."""
+    """Return the fractions (N,) of the sphere in which a new scan is in front of the old, and behind it.
+
+    The spheres are those around centres (N, 3) [m].
+    """
     area = whole_areas(SEARCH_VIEW.num_rings).astype(np.float64)
 
     def compare(lo: int) -> tuple[Array, Array]:
@@ -149,8 +153,8 @@ def compare_ranges(new: Octree, old: Octree, centers: Array, workers: Workers) -
 def join_views(
     old: ScanMap, octree: Octree, found: Candidates, sparse: Int64s, workers: Workers
 ) -> WideViews:
-    """Join wide views of the sparse candidates: render those that have changed or that the map lacks."""
-    known = np.full(len(old.centers), -1)  # row among the map's views
+    """Return the wide views of the sparse candidates: the map's own, or rendered if changed or missing."""
+    known = np.full(len(old.centers), -1)  # row of a candidate's view among the map's, or -1
     known[old.sparse] = np.arange(len(old.sparse))
     place = np.full(len(found.centers), -1)
     place[: len(found.rows)] = known[found.rows]
@@ -168,8 +172,12 @@ def join_views(
 
 
 def assign_scans(old: ScanMap, found: Candidates) -> Uint16s:
-    """Assign a scan to each candidate (N,): its old one, the nearest candidate's, or the new one."""
-    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
+    """Return the index (N,) of the scan of each candidate.
+
+    It is the new scan's if that is mostly in front; else a candidate of the map keeps its own, and a new one
+    has that of the nearest candidate of the map.
+    """
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # imported only when a scan is added
 
     num_known = len(found.rows)
     scans = np.zeros(len(found.centers), np.uint16)

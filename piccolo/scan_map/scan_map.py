@@ -1,4 +1,4 @@
-"""The map prepared once per cloud: octree, candidate camera positions, coarse views, names of its scans."""
+"""The map that is prepared once per cloud: octree, candidate camera positions, their views, scan names."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,48 +23,48 @@ from .drawn_places import DrawnPlaces
 from .storeys import Storeys, find_storeys
 
 SHAPE_ALONE = "photos are localized by the shape of the scan, without colours"
-LEAST_DEVIATION = 0.004  # of luminance, by rounding colours to 8 bits
-MAX_TILT = np.radians(5.0)  # of the floors to the axis taken for up; a larger one is warned of
+LEAST_DEVIATION = 0.004  # of luminance: less comes from rounding colours to 8 bits
+MAX_TILT = np.radians(5.0)  # between the floors' normal and the axis taken as up; a larger one is warned of
 MAX_SCAN_NAME = 100  # characters
-MAX_SCANS = 1000  # of a map
+MAX_SCANS = 1000  # in one map
 
 
 @dataclass(frozen=True)
 class ScanMap(MapFrame):
-    """A prepared cloud, in a frame of its own."""
+    """A prepared cloud, in the map's frame: z up, with an origin of its own."""
 
     octree: Octree
-    surface_variance: Array  # (3, 3) [m^2] that the scan's noise and doubled surfaces give to a position
-    layers: Array  # (3, 3) motion between two layers of the surfaces, see `Layers`; zero if there is one
-    centers: Array  # (candidates, 3) [m]
-    scan_of_candidate: Uint16s  # (candidates,) index of its name in scan_names
-    sparse: Int64s  # candidates that are searched: no two share a cell of the coarse grid
-    wide_features: Int8s  # (sparse, 3 * wide cells) what is seen from them, channels in levels
-    wide_seen: Bytes  # (sparse, wide cells) fraction seen of each, 255 for all
-    views: CandidateViews  # of fine cells, made when they are asked for; not in files
-    places: DrawnPlaces  # positions with pictures of the scan, made when they are asked for; not in files
-    has_shape: bool = False  # colours are edges of the surfaces, of a scan without colours
-    scan_names: tuple[str, ...] = ()  # of the scans put together; none if none was named
+    surface_variance: Array  # (3, 3) [m^2] of surfaces, by the scan's noise and doubled surfaces
+    layers: Array  # (3, 3) motion between two layers of the surfaces, see `Layers`; 0 if there is one
+    centers: Array  # (candidates, 3) [m] possible camera positions
+    scan_of_candidate: Uint16s  # (candidates,) index of its scan in scan_names
+    sparse: Int64s  # (sparse,) indices of the candidates that are searched, one in a cell of the coarse grid
+    wide_features: Int8s  # (sparse, 3 * wide cells) the views from these, channels in levels
+    wide_seen: Bytes  # (sparse, wide cells) fraction of each cell that is seen, 255 for all of it
+    views: CandidateViews  # on fine cells, rendered when needed; not in files
+    places: DrawnPlaces  # positions with pictures of the scan, drawn when needed; not in files
+    has_shape: bool = False  # the scan has no colours: the octree's are edges of the surfaces
+    scan_names: tuple[str, ...] = ()  # of the scans that were put together; empty if none was named
     warnings: tuple[str, ...] = ()
-    scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
-    crs: str = ""  # coordinate system that the scan's file names, as WKT or EPSG:code; empty if none
-    is_partial: bool = False  # of a scan too large as a whole: candidates where a prior asks; not in files
+    scan_sha256: str = ""  # hexadecimal digest of the files or arrays from which it was made
+    crs: str = ""  # coordinate system that the scan's file names, as WKT or EPSG:code, or empty
+    is_partial: bool = False  # the scan is too large: candidates only where a prior allows; not in files
 
     @cached_property
     def points(self) -> PackedPoints:
-        """Leaves of the octree as coloured points, in the map's frame."""
+        """The octree's finest voxels as coloured points, in the map's frame."""
         leaves = self.octree.level(self.octree.leaf_size)
         return pack_points(leaves[:, :3], np.round(leaves[:, 3:] * 255.0).astype(np.uint8))
 
     @cached_property
     def has_intensity(self) -> bool:
-        """True for a map of shape whose points differ in intensity too."""
+        """True for a map without colours whose points differ in intensity."""
         luminance = self.octree.level(COARSE_SPACING)[:, 3:].mean(axis=1)
         return self.has_shape and float(luminance.std()) > LEAST_DEVIATION
 
     @cached_property
     def displacement(self) -> float:
-        """Deviation [m] of surfaces from where they are, of each against the others."""
+        """Standard deviation [m] by which surfaces are displaced, each independently of the others."""
         return displacement(self.octree)
 
     @cached_property
@@ -74,17 +74,17 @@ class ScanMap(MapFrame):
 
     @cached_property
     def yaw_of_walls(self) -> float | None:
-        """The turn about z [rad], in (-45, 45] deg, that puts the walls along x and y; None without walls."""
+        """The turn about z [rad], in (-45, 45] deg, that aligns walls with x and y; None without walls."""
         return find_yaw_of_walls(self.octree)
 
     @cached_property
     def searched_for(self) -> Int64s:
-        """Index (candidates,) of the candidate searched for each one, in its cell of the coarse grid."""
+        """The index (candidates,) of the candidate that is searched in each one's cell of the coarse grid."""
         first, cell = sparse_candidates(self.centers)
         return first[cell]
 
     def narrow(self, is_kept: Mask) -> "ScanMap":
-        """Return the map with only some (sparse,) of the searched candidates."""
+        """Return the map with only those searched candidates that a mask (sparse,) keeps."""
         return replace(
             self,
             sparse=self.sparse[is_kept],
@@ -94,9 +94,9 @@ class ScanMap(MapFrame):
 
 
 def sparse_candidates(centers: Array) -> tuple[Int64s, Int64s]:
-    """Return indices of the candidates (N, 3) [m] that come first in their cells of the coarse grid.
+    """Return the indices (S,) of the candidates that come first in their cells of the coarse grid.
 
-    And for each candidate (N,) the index of its cell among these.
+    `centers` (N, 3) [m] are all candidates. Return also, for each (N,), the index of its cell among the S.
     """
     cells = np.floor(centers / COARSE_SPACING).astype(np.int64)
     cells -= cells.min(axis=0, initial=0)
@@ -108,8 +108,9 @@ def sparse_candidates(centers: Array) -> tuple[Int64s, Int64s]:
 def find_candidates(
     octree: Octree, R_map_from_world: Array, origin_world: Array, part: Ball | None, workers: Workers
 ) -> tuple[Array, tuple[str, ...]]:
-    """Find candidates (N, 3) [m]; in a scan too large as a whole only in a part of the world, with a warning.
+    """Find candidates (N, 3) [m] in the map's frame; return them with warnings.
 
+    If the scan is too large as a whole, they are only in `part`, a ball of the world, and a warning says so.
     The map's frame is given by R_map_from_world (3, 3) and origin_world (3,) [m].
     """
     try:
@@ -132,10 +133,11 @@ def prepare_map(
     watch: Stopwatch | None = None,
     part: Ball | None = None,
 ) -> ScanMap:
-    """Prepare a map of a cloud; of one without colours it holds the edges of the surfaces in their place.
+    """Prepare a map of a cloud; if it has no colours, the edges of its surfaces take their place.
 
-    The named axis is up, with `auto` the file's; or a rotation (3, 3) makes z up. Of a scan too large as a
-    whole only a part of the world is prepared; TooManyPositionsError if none is given.
+    `up` names the axis that is up, with "auto" that of the file's format; or it is a rotation (3, 3)
+    R_map_from_world that makes z up. If the scan is too large as a whole, only `part`, a ball of the world,
+    is prepared; raise TooManyPositionsError if there is none.
     """
     watch = watch or Stopwatch()
     R_map_from_world = R_z_from_axis(up, cloud.up) if isinstance(up, str) else up
@@ -149,7 +151,7 @@ def prepare_map(
     has_shape = not cloud.has_colors
     if has_shape:
         warnings += (SHAPE_ALONE,)
-    for warning in warnings:  # now: a wrong unit makes what follows long
+    for warning in warnings:  # before the long steps, which take longer still in a wrong unit
         workers.warn(warning)
     with watch.stage("prepare"):
         if has_shape:
@@ -180,7 +182,7 @@ def prepare_map(
 def look_for_layers(
     octree: Octree, R_map_from_world: Array, origin_world: Array, workers: Workers
 ) -> tuple[Array, tuple[str, ...]]:
-    """Return the motion (3, 3) between two layers of a scan, with a warning; zero and none if it has one."""
+    """Return the motion (3, 3) between two layers of a scan with a warning; zero and no warning without."""
     found = find_layers(octree, workers)
     if found is None:
         return NO_LAYERS, ()
@@ -190,7 +192,7 @@ def look_for_layers(
 
 
 def change_colors(scan_map: ScanMap, octree: Octree, workers: Workers) -> ScanMap:
-    """Return the map with an octree of the same points in other colours."""
+    """Return the map with another octree, of the same points in other colours, and its views."""
     wide = render_wide(octree, scan_map.centers[scan_map.sparse], SEARCH_VIEW, workers)
     return replace(
         scan_map,
@@ -204,7 +206,7 @@ def change_colors(scan_map: ScanMap, octree: Octree, workers: Workers) -> ScanMa
 
 
 def check_up(octree: Octree, R_map_from_world: Array, taken: UpAxis) -> tuple[str, ...]:
-    """Warn if the floors face clearly away from the map's z, naming the nearest axis."""
+    """Return a warning if the floors clearly do not face the map's z; it names the world's nearest axis."""
     axis, sense, reason, _ = find_up(octree)
     cosine = sense * axis[2]
     if sense == 0.0 or cosine > np.cos(MAX_TILT):
@@ -219,12 +221,12 @@ def check_up(octree: Octree, R_map_from_world: Array, taken: UpAxis) -> tuple[st
 
 
 def is_name(name: str) -> bool:
-    """Return True for one line of text that can be printed."""
+    """Return True for a valid name: one printable line without spaces around it, not too long."""
     return 1 <= len(name) <= MAX_SCAN_NAME and name.isprintable() and name == name.strip()
 
 
 def check_name(name: str, taken: Sequence[str]) -> None:
-    """Refuse an invalid or duplicate name of a scan, or one scan too many."""
+    """Refuse an invalid name of a new scan, one that is taken, and one scan too many."""
     if not is_name(name):
         raise InputError(f"`name`: found {name[:200]!r}, wanted 1 to {MAX_SCAN_NAME} printable characters")
     if name in taken:
@@ -234,7 +236,7 @@ def check_name(name: str, taken: Sequence[str]) -> None:
 
 
 def name_scan(scan_map: ScanMap, name: str) -> ScanMap:
-    """Name the scan of a map of one scan."""
+    """Return a map of one scan with a name for that scan."""
     check_name(name, ())
     if len(scan_map.scan_names) > 1:
         raise InputError(f"`name`: found a map of several scans: {_list_names(scan_map.scan_names)}")
@@ -258,12 +260,12 @@ def check_within(scan_map: ScanMap, within: Sequence[str]) -> None:
 
 def candidates_within(scan_map: ScanMap, within: Sequence[str]) -> Mask:
     """Return a mask (N,) of the candidates in the scans of these names."""
-    named_so = [k for k, name in enumerate(scan_map.scan_names) if name in within]
-    return np.isin(scan_map.scan_of_candidate, named_so)
+    indices = [k for k, name in enumerate(scan_map.scan_names) if name in within]
+    return np.isin(scan_map.scan_of_candidate, indices)
 
 
 def find_scan_at(scan_map: ScanMap, center_map: Array) -> str | None:
-    """Return the scan in which a place (3,) lies, by the nearest candidate; None if there are no names."""
+    """Return the scan of the candidate nearest to a place (3,) [m]; None if scans have no names."""
     if not (scan_map.scan_names and len(scan_map.centers)):
         return None
     offsets = scan_map.centers - center_map
@@ -272,5 +274,5 @@ def find_scan_at(scan_map: ScanMap, center_map: Array) -> str | None:
 
 
 def scan_of(scan_map: ScanMap, pose: Pose) -> str | None:
-    """Return the scan in which a pose of the world lies."""
+    """Return the scan in which a pose in the world lies, by name; None if scans have no names."""
     return find_scan_at(scan_map, scan_map.from_world(pose).center_world)

@@ -10,34 +10,34 @@ from ..geometry.points import FARTHEST_POINT
 from ..system.arrays import Array, Array32, Int64s, Mask
 from .camera_positions import SURFACE_VOXEL
 
-HEADROOM_VOXELS = 11  # voxels above a surface that are empty, 1.8 m
-THICKNESS = 1  # voxels up and down that are of one floor: noise, thresholds, ramps
-FLOOR_OPENING = 5  # [voxels] width of the disc that fits on a floor, 0.8 m: on shelves and steps it does not
-LEAST_AREA = 3.0  # of a storey's floor [m2]
-LEAST_FRACTION = 0.15  # of the largest floor's area
+HEADROOM_VOXELS = 11  # empty voxels above a surface on which a person can stand, 1.8 m
+THICKNESS = 1  # [voxels] up and down within one floor: noise, thresholds, ramps
+FLOOR_OPENING = 5  # [voxels] width of a disc that must fit on a floor, 0.8 m: it fits on no shelf or step
+LEAST_AREA = 3.0  # [m2] of a floor
+LEAST_FRACTION = 0.15  # least area of a floor, divided by the largest floor's
 LEAST_STOREY_HEIGHT = 2.3  # [m] between the floors of two storeys
-LEAST_ABOVE = 1.0  # voxels a m2 of walls or furniture above a floor: a ceiling from above has none
-LEAST_OVERLAP = 0.15  # of the smaller floor; below, two are one storey on a slope or in two wings
-# [m] below and above a storey's levels lie its surfaces; farther below is the ceiling of the next one
+LEAST_ABOVE = 1.0  # least number of voxels a m2 above a floor; above a ceiling there are none
+LEAST_OVERLAP = 0.15  # of the smaller floor; two that overlap less are one storey: two wings, a slope
+# [m] a storey's surfaces are so far below and above its levels; the next storey's ceiling is lower
 BELOW_LEVEL = 0.25
 ABOVE_LEVEL = 0.5
-FLOOR_GAP = 17  # [voxels] of a floor that furniture hid from the scanner, 2.7 m
-MOST_BESIDE_FLOOR = 1.5  # [m] a camera may be from the nearest scanned floor of its storey
-FIRST_REACH = 1.0  # [m] around a place, in which surfaces are looked for first
-NUM_NEAREST = 40  # surfaces around a place, 0.6 m
-LOW = 10.0  # percentile of them that is the floor
+FLOOR_GAP = 17  # [voxels] gaps of a floor that furniture hides from the scanner, 2.7 m
+MOST_BESIDE_FLOOR = 1.5  # [m] across from a camera to the nearest scanned floor of its storey, at most
+FIRST_REACH = 1.0  # [m] radius around a place in which surfaces are searched first
+NUM_NEAREST = 40  # surfaces around a place, within about 0.6 m, that give the floor's height
+LOW = 10.0  # [%] percentile of their heights that is the floor's
 
 
 class Storey(NamedTuple):
     """One storey, in the map's frame."""
 
-    floor: float  # [m] height of its largest level
-    surfaces: Array32  # (N, 3) [m] of its floor, in order of their x
+    floor: float  # [m] height of its largest level, in the map
+    surfaces: Array32  # (N, 3) [m] points of its floor, sorted by x
 
     def nearest(self, center: Array, count: int) -> tuple[Array, Array]:
-        """Return horizontal distances to the nearest `count` surfaces of a place (3,), and their heights [m].
+        """Return horizontal distances [m] and heights [m] of the `count` surfaces nearest to a place (3,).
 
-        SciPy's tree finds them no faster for the few places of a photo, and takes 0.2 s to import.
+        For the few places of a photo SciPy's tree is no faster, and takes 0.2 s to import.
         """
         x = self.surfaces[:, 0]
         reach = FIRST_REACH
@@ -57,10 +57,10 @@ class Storeys(NamedTuple):
     storeys: tuple[Storey, ...]
 
     def at(self, centers: Array) -> tuple[Int64s, Array]:
-        """Return the index of the storey of each place (N, 3), and its height above the floor there (N,) [m].
+        """Return the index (N,) of the storey of each place (N, 3) [m], and the height (N,) [m] above it.
 
-        It is the highest storey whose floor is below the place and scanned around it; -1 and NaN without
-        storeys.
+        The storey is the highest whose floor is below the place and was scanned near it; if no floor was
+        scanned near, the highest with a floor below; else the lowest. Without storeys they are -1 and NaN.
         """
         storey = np.full(len(centers), -1)
         height = np.full(len(centers), np.nan)
@@ -77,7 +77,7 @@ class Storeys(NamedTuple):
 
 
 def find_storeys(octree: Octree) -> Storeys:
-    """Find the storeys of a map by the surfaces of its octree."""
+    """Find the storeys of a map in the surfaces of its octree."""
     xyz = octree.level(SURFACE_VOXEL)[:, :3]
     ijk = np.floor(xyz / SURFACE_VOXEL).astype(np.int64)
     ijk -= ijk.min(axis=0) - 1
@@ -102,20 +102,19 @@ def _is_standable(ijk: Int64s) -> Mask:
     shape = ijk.max(axis=0, initial=0) + HEADROOM_VOXELS + 2
     code = (ijk[:, 0] * shape[1] + ijk[:, 1]) * shape[2] + ijk[:, 2]
     order = np.argsort(code)
-    following = np.append(
-        np.diff(code[order]), HEADROOM_VOXELS + 1
-    )  # voxels to the next one above, or beyond it
+    # voxels from each one up to the next; the last one has none above it
+    gap = np.append(np.diff(code[order]), HEADROOM_VOXELS + 1)
     is_free = np.empty(len(code), np.bool_)
-    is_free[order] = following > HEADROOM_VOXELS
+    is_free[order] = gap > HEADROOM_VOXELS
     return is_free
 
 
 def _find_levels(ijk: Int64s, tops: Int64s) -> dict[int, Mask]:
-    """Find the floors by their height [voxels], ascending, with the cells (I, J) of each.
+    """Return the mask (I, J) of each floor's cells by the floor's height [voxels], lowest first.
 
-    `ijk` (N, 3) are all voxels, `tops` those with room above. The largest floor is taken first, then those
-    that are LEAST_STOREY_HEIGHT from others or overlap them little. Floors on which nothing stands are left
-    out.
+    `ijk` (N, 3) are all voxels, `tops` those with room above. The largest floor is found first; each further
+    one must be LEAST_STOREY_HEIGHT from those before or hardly overlap them. Floors on which nothing stands
+    are left out.
     """
     if not len(tops):
         return {}
@@ -139,7 +138,7 @@ def _find_levels(ijk: Int64s, tops: Int64s) -> dict[int, Mask]:
 
 
 def _open_level(ijk: Int64s, tops: Int64s, level: int) -> Mask:
-    """Return the cells (I, J) of a level on which a disc fits, small gaps closed."""
+    """Return the mask (I, J) of a level's cells on which a disc fits, with small gaps closed."""
     mask = np.zeros(ijk.max(axis=0)[:2] + 2, np.uint8)
     own = tops[np.abs(tops[:, 2] - level) <= THICKNESS]
     mask[own[:, 0], own[:, 1]] = 1
@@ -149,7 +148,7 @@ def _open_level(ijk: Int64s, tops: Int64s, level: int) -> Mask:
 
 
 def _has_things_above(ijk: Int64s, level: int, mask: Mask) -> bool:
-    """Return True if anything is on a floor or around it."""
+    """Return True if anything stands on a floor or around it."""
     wide = cv2.dilate(mask.astype(np.uint8), np.ones((FLOOR_OPENING, FLOOR_OPENING), np.uint8))
     is_above = (ijk[:, 2] > level + THICKNESS) & (ijk[:, 2] <= level + HEADROOM_VOXELS)
     count = wide[ijk[is_above, 0], ijk[is_above, 1]].sum()
@@ -157,7 +156,7 @@ def _has_things_above(ijk: Int64s, level: int, mask: Mask) -> bool:
 
 
 def _overlap(mask: Mask, other: Mask) -> float:
-    """Return the fraction of the smaller of two floors that overlaps the other or a gap in it."""
+    """Return the fraction of the smaller of two floors (I, J) that overlaps the other, gaps filled."""
     square = np.ones((FLOOR_GAP, FLOOR_GAP), np.uint8)
     one, two = (cv2.morphologyEx(m.astype(np.uint8), cv2.MORPH_CLOSE, square) > 0 for m in (mask, other))
     return float((one & two).sum() / max(min(one.sum(), two.sum()), 1))

@@ -1,1 +1,1 @@
-"""The scan as it is seen from a place."""
+"""The scan drawn from a position or at a pose."""

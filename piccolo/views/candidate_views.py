@@ -1,7 +1,7 @@
-"""Views from a map's candidates: wide cells of all that are searched, fine ones of some.
+"""Views from a map's candidates: on wide cells for all that are searched, on fine cells for some.
 
-Wide cells are prepared with the map. A view of fine cells is made when a search first comes upon its
-candidate, and kept until there are many.
+Views on wide cells are prepared with the map. A view on fine cells is rendered when a search first needs it,
+and kept until there are too many.
 """
 
 import math
@@ -31,32 +31,32 @@ from .view import (
     thread_scratch,
 )
 
-WIDE_RINGS = 12
+WIDE_RINGS = 12  # rings of wide cells on the sphere, 15 degrees each
 SEARCH_VIEW = ViewConfig(num_rings=SEARCH_RINGS, stats_rings=16, sigma_deg=22.0, voxel_per_range=1 / 15)
-WIDE_VOXEL_PER_RANGE = 1 / 8  # of the same view where it is averaged over wide cells
-LEAST_ROOM = 256  # views
-MOST_KEPT = 1 << 15  # views, 0.24 GB
+WIDE_VOXEL_PER_RANGE = 1 / 8  # the same of views that are averaged over wide cells
+LEAST_ROOM = 256  # views for which memory is allocated at first
+MOST_KEPT = 1 << 15  # views that are kept, 0.24 GB
 
 
 class Views(NamedTuple):
-    """Views from some centres, as kernels read them."""
+    """Views from n centres in the map, as kernels read them."""
 
     centers: Array  # (n, 3) [m]
-    offsets: NDArray[np.int16]  # (n, 3, cells) from the centre to what is seen, in units of
+    offsets: NDArray[np.int16]  # (n, 3, cells) from the centre to the surface, times 1 / offset_unit
     offset_unit: Array32  # (n,) [m]
     features: Int8s  # (n, 3, cells) channels in levels, 0 where nothing is seen
     is_seen: Mask  # (n, cells)
 
 
 class WideViews(NamedTuple):
-    """Views from some centres, averaged over wide cells."""
+    """Views from n centres in the map, averaged over wide cells."""
 
     features: Int8s  # (n, 3 * wide cells) channels in levels
-    seen: Bytes  # (n, wide cells) fraction seen of each, 255 for all
+    seen: Bytes  # (n, wide cells) fraction of the cell in which the scan is seen, 255 for all of it
 
 
 def empty_views(num: int, num_cells: int) -> Views:
-    """Return arrays, not filled, for `num` views of `num_cells` cells."""
+    """Return uninitialised arrays for `num` views of `num_cells` cells."""
     if num:
         bytes_per_cell = 6 + 3 + 1  # offsets, channels, seen
         check_memory(num * num_cells * bytes_per_cell, f"the scan: {num} views", "cut out a part of it")
@@ -71,7 +71,7 @@ def empty_views(num: int, num_cells: int) -> Views:
 
 @inline_kernel
 def encode_level(channel: Scalar) -> np.int8:
-    """Return a normalised channel in 8 bits."""
+    """Return a normalised channel [standard deviations] in levels of 8 bits."""
     level: Scalar = math.floor(channel * np.float32(LEVELS_PER_UNIT) + HALF)
     return np.int8(min(max(level, np.float32(-127)), np.float32(127)))
 
@@ -80,7 +80,7 @@ def encode_level(channel: Scalar) -> np.int8:
 def render_block(
     tree: Octree, voxel_per_range: float, view: ViewArrays, scratch: Scratch, views: Views
 ) -> None:
-    """Write the views from their centres."""
+    """Render the views from `views.centers` and write them into the other arrays of `views`."""
     n = len(view.solid_angle)
     points = np.empty((3, n), np.float32)
     channels = np.empty((3, n), np.float32)
@@ -115,9 +115,9 @@ def render_wide_block(
 ) -> None:
     """Write views from several centres (n, 3) [m], averaged over wider cells, in few bits.
 
-    The wider cells are those that hold the statistics. `features` (n, 3, wider cells) are channels in levels,
-    averaged over a cell's whole area, where what is not seen counts as 0; `seen` (n, wider cells) is the
-    fraction of this area that is seen, 255 for all.
+    The wider cells are those of the view's statistics. `features` (n, 3, wider cells) get the channels in
+    levels, averaged over the whole area of a cell; channels are 0 where nothing is seen. `seen` (n, wider
+    cells) gets the fraction of this area in which something is seen, 255 for all of it.
     """
     n = len(view.solid_angle)
     points = np.empty((3, n), np.float32)
@@ -161,7 +161,7 @@ def render_views(octree: Octree, centers: Array, config: ViewConfig, workers: Wo
 def render_wide(octree: Octree, centers: Array, config: ViewConfig, workers: Workers) -> WideViews:
     """Render the views from some centres (n, 3) [m], averaged over wide cells.
 
-    Their voxels are larger than `config` says: averages need no finer ones.
+    The voxels are WIDE_VOXEL_PER_RANGE wide, not as `config` says: averages need no finer ones.
     """
     config = replace(config, stats_rings=WIDE_RINGS, voxel_per_range=WIDE_VOXEL_PER_RANGE)
     num, num_wide = len(centers), len(make_grid(WIDE_RINGS))
@@ -182,13 +182,13 @@ def render_wide(octree: Octree, centers: Array, config: ViewConfig, workers: Wor
 
 @dataclass(eq=False)
 class CandidateViews:
-    """Views of fine cells from a map's candidates, each made when it is first asked for, by any thread."""
+    """Views on fine cells from a map's candidates, each rendered at its first use; threads may share this."""
 
     octree: Octree
     centers: Array  # (candidates, 3) [m]
     config: ViewConfig = SEARCH_VIEW
     most_kept: int = MOST_KEPT
-    made: Views = field(init=False)  # with room for more
+    made: Views = field(init=False)  # the first `num_made` rows are views, the rest is free
     num_made: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
@@ -202,19 +202,19 @@ class CandidateViews:
         self._row = np.full(len(self.centers), -1, np.int64)
 
     def at(self, candidates: Int64s, workers: Workers) -> tuple[Int64s, Views]:
-        """Return the rows (n,) of candidates (n,) in the views, made if missing, and the views."""
+        """Return (rows, views): the rows (n,) of candidates (n,) in the views; missing views are rendered."""
         with self._lock:
             missing = np.unique(candidates[self._row[candidates] < 0])
             if len(missing) and self.num_made + len(missing) > self.most_kept:
                 missing = np.unique(candidates)
-                self._forget()  # who was given the old ones has them
+                self._forget()  # callers keep the old arrays that they hold
             if len(missing):
                 self._append(render_views(self.octree, self.centers[missing], self.config, workers))
                 self._row[missing] = np.arange(self.num_made - len(missing), self.num_made)
             return self._row[candidates], self.made
 
     def _append(self, views: Views) -> None:
-        """Append views to those made; without room, copy all to arrays twice as long. No row changes."""
+        """Append views; if there is no room, first copy the old ones to larger arrays. Rows stay the same."""
         begin = self.num_made
         self.num_made += len(views.centers)
         if self.num_made > len(self.made.centers):
@@ -226,6 +226,6 @@ class CandidateViews:
 
 
 def put_rows(wholes: Sequence[Any], begin: int, parts: Sequence[Any]) -> None:
-    """Copy each array of `parts` into the array of `wholes` at its place, from row `begin` on."""
+    """Copy each array of `parts` into the array of `wholes` with the same index, from row `begin` on."""
     for whole, part in zip(wholes, parts, strict=True):
         whole[begin : begin + len(part)] = part

@@ -1,7 +1,7 @@
-"""Edges of a scan without colours as seen from a place: outlines of what is in front, and creases.
+"""Edges of a scan without colours as seen from a position: outlines of nearer surfaces, and creases.
 
-Along a plane the inverse range is linear in the angle; where it bends, a photo shows an edge. Outlines depend
-on the place, so they can't be painted on the scan as `cloud.surfaces` paints creases and borders.
+Along a plane the inverse range is nearly linear in the angle; where it bends, a photo shows an edge. Outlines
+depend on the position, so they can't be painted on the scan as `cloud.surfaces` paints creases and borders.
 """
 
 import math
@@ -15,13 +15,18 @@ from ..geometry.sphere import cells_around, make_grid
 from ..photo.panorama.edges import COS_UPRIGHT_EDGE
 from ..system.arrays import Array32, Floats, Int32s
 
-FULL_BEND = 0.07  # of the inverse range from cell to cell; the strength is the root of the fraction
-FAR_BELOW = -1e12  # so far below that no value interpolated with it is positive
+# bend, relative to the inverse range, of an edge of strength 1; of less, the strength is the root
+FULL_BEND = 0.07
+FAR_BELOW = -1e12  # inverse range of empty cells: a value interpolated with it is negative
 
 
 @lru_cache(maxsize=1)
 def find_sides(num_rings: int) -> tuple[Int32s, Array32]:
-    """Return the cells (4 N, 4) around the places a cell to the left, right, above and below each of N."""
+    """Return the cells and weights (4 N, 4) that interpolate at the four neighbours of each of N cells.
+
+    A neighbour is a cell away. The first N rows are all neighbours to the left; then those to the right,
+    above and below.
+    """
     grid = make_grid(num_rings)
     x, y, z = grid.directions.astype(np.float64).T
     turn = math.tau / np.repeat(grid.num_columns, grid.num_columns)
@@ -30,21 +35,21 @@ def find_sides(num_rings: int) -> tuple[Int32s, Array32]:
     level = np.cos(elevation)  # negative across a pole
     rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
     cells, weights = cells_around(rays.reshape(-1, 3), num_rings)
-    return cells, np.round(weights, 4)  # 0 of what rounding alone reaches
+    return cells, np.round(weights, 4)  # weights that are rounding errors become 0
 
 
 def replace_by_edges(sums: Array32, num_rings: int) -> None:
-    """Replace the colours in the sums (N, 8) of a view, as of `average_nodes`, by edges; their grey stays."""
+    """Replace the colours in the sums (N, 8) of a view, as `average_nodes` writes them, by edges and grey."""
     cells, weights = find_sides(num_rings)
 
-    def look(values: Floats) -> Floats:
+    def interpolate(values: Floats) -> Floats:
         return np.asarray((values[cells] * weights).sum(axis=1).reshape(4, -1))
 
     counts = np.maximum(sums[:, 6], 1.0)
     inverse = np.where(
         sums[:, 6] > 0.0, counts / np.maximum(np.linalg.norm(sums[:, :3], axis=1), 1e-9), FAR_BELOW
     )
-    sides = look(inverse).reshape(2, 2, -1)
+    sides = interpolate(inverse).reshape(2, 2, -1)
     bend = sides.sum(axis=1) - 2.0 * inverse
     nearest = np.where(bend < 0.0, inverse, sides.max(axis=1))
     is_whole = np.minimum(sides.min(axis=1), inverse) > 0.0
@@ -52,6 +57,6 @@ def replace_by_edges(sums: Array32, num_rings: int) -> None:
     across, down = np.sqrt(np.minimum(part, 1.0))
     strength = np.maximum(across, down)
     vertical = strength * rise(across / np.maximum(np.hypot(across, down), 1e-9), COS_UPRIGHT_EDGE)
-    strength, vertical = ((2.0 * edge + look(edge).sum(axis=0)) / 6.0 for edge in (strength, vertical))
+    strength, vertical = ((2.0 * e + interpolate(e).sum(axis=0)) / 6.0 for e in (strength, vertical))
     gray = 2.0 * (sums[:, 3:6].mean(axis=1) / counts) - 0.5
     sums[:, 3:6] = sums[:, 6:7] * (colors_of_edges(strength, vertical, gray) / np.float32(255.0))

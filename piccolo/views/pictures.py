@@ -1,4 +1,4 @@
-"""Pictures for people: holes filled, overlays, a camera's part of the sphere, files."""
+"""Pictures of the scan for people: filled holes, overlays with a photo, a camera's part of the sphere."""
 
 import math
 
@@ -19,22 +19,23 @@ from .zbuffer import View
 
 OVERLAY_WIDTH = 1024
 NUM_TILES = 16  # columns of the checkerboard
-MAX_DRAWN_WIDTH = 8192  # [px]
+MAX_DRAWN_WIDTH = 8192  # [px] of a sphere that is drawn for a camera's picture
 UPRIGHT = np.eye(3)
 
 
 def fill_holes(rgb: Bytes, is_seen: Mask) -> Bytes:
     """Fill the pixels of a picture (H, W, 3) where `is_seen` (H, W) is False from the colours around them.
 
-    They come from the picture filled at half the size: the larger the hole, the smoother. All is computed in
-    bytes, as floating-point copies of a large picture would take gigabytes. Black if nothing is seen.
+    The colours come from the picture at half its size, which is filled in the same way: the larger the hole,
+    the smoother. All is computed in bytes, as floating-point copies of a large picture would take gigabytes.
+    The result is black if nothing is seen.
     """
     height, width = is_seen.shape
     if is_seen.all() or width == 1:
         return rgb
     counts = is_seen.view(np.uint8) * np.uint8(255)
     masked = cv2.bitwise_and(rgb, rgb, mask=counts)
-    if height % 2 or width % 2:  # a row more counts nothing, a column more is the first again
+    if height % 2 or width % 2:  # an added row has no weight, an added column repeats the first
         counts = np.pad(np.pad(counts, ((0, height % 2), (0, 0))), ((0, 0), (0, width % 2)), mode="wrap")
         masked = np.pad(masked, ((0, height % 2), (0, 0), (0, 0)))
         masked = np.pad(masked, ((0, 0), (0, width % 2), (0, 0)), mode="wrap")
@@ -52,16 +53,17 @@ def fill_holes(rgb: Bytes, is_seen: Mask) -> Bytes:
 
 
 def checkerboard(photo: Bytes, cloud: Bytes) -> Bytes:
-    """Stack two images (H, W, 3) and a checkerboard of both, one above the other (3 H, W, 3)."""
+    """Stack two images (H, W, 3) and a checkerboard of both, from top to bottom, into one (3 H, W, 3)."""
     row, column = np.indices(photo.shape[:2]) // (photo.shape[1] // NUM_TILES)
     mixed = np.where(((row + column) % 2 == 0)[..., None], photo, cloud)
     return np.concatenate([photo, cloud, mixed])
 
 
 def overlay_png(points: PackedPoints, panorama: Panorama, pose: Pose, workers: Workers) -> bytes:
-    """Return a PNG file of panorama, cloud rendered at the pose and checkerboard of both, top to bottom.
+    """Return a PNG file of the panorama, the cloud rendered at the pose and a checkerboard of both.
 
-    A photo by one camera is shown in its own field, others as spheres.
+    The three are stacked from top to bottom. A photo by one camera is shown in that camera's field of view,
+    any other as a sphere.
     """
     if len(panorama.cameras) != 1:
         view = render_points(points, pose, OVERLAY_WIDTH, workers)
@@ -76,35 +78,44 @@ def overlay_png(points: PackedPoints, panorama: Panorama, pose: Pose, workers: W
 
 
 def sphere_width_for(camera: Camera) -> int:
-    """Return the even width [px] of a sphere as fine as the camera at its axis, up to MAX_DRAWN_WIDTH."""
+    """Return the width [px], even, of a sphere as fine as a camera near its axis; at most MAX_DRAWN_WIDTH."""
     return min(2 * math.ceil(math.pi * camera.resolution), MAX_DRAWN_WIDTH)
 
 
 def cut(image: Bytes, camera: Camera, R_lens_from_cam: Array = UPRIGHT) -> Bytes:
-    """Return a camera's picture (height, width, 3) of a sphere's (H, W, 3); black where it shows nothing."""
-    u, v, is_in = _places(camera, image.shape[1], R_lens_from_cam)
-    found = sample_sphere(image, u, v)
-    found[~is_in] = 0
-    return found
+    """Return the picture (height, width, 3) that a camera takes of a sphere's picture (H, W, 3).
+
+    It is black at pixels that no ray reaches.
+    """
+    u, v, is_in = _sphere_pixels(camera, image.shape[1], R_lens_from_cam)
+    picture = sample_sphere(image, u, v)
+    picture[~is_in] = 0
+    return picture
 
 
 def sample_sphere(image: Bytes, u: Array32, v: Array32) -> Bytes:
-    """Return the colours of a sphere's picture (H, W, ...) at its columns and rows (h, w) [px], bilinear."""
+    """Return the colours of a sphere's picture (H, W, ...) at columns and rows (h, w) [px], bilinear."""
     around = np.concatenate([image[:, -1:], image, image[:, :1]], axis=1)
     return np.asarray(cv2.remap(around, u + np.float32(0.5), v - np.float32(0.5), cv2.INTER_LINEAR), np.uint8)
 
 
 def cut_view(view: View, camera: Camera) -> View:
-    """Return a camera's view from the sphere's: ranges of the nearest pixels, inf where it shows nothing."""
+    """Return the view of a camera, cut out of the sphere's view.
+
+    Ranges are those of the nearest pixel, inf where no ray reaches or nothing is seen.
+    """
     width = view.depth.shape[1]
-    u, v, is_in = _places(camera, width, UPRIGHT)
+    u, v, is_in = _sphere_pixels(camera, width, UPRIGHT)
     rows = np.clip(v.astype(np.int64), 0, width // 2 - 1)
     depth = np.where(is_in, view.depth[rows, u.astype(np.int64) % width], np.float32(np.inf))
     return View(depth, cut(view.rgb, camera))
 
 
-def _places(camera: Camera, width: int, R_lens_from_cam: Array) -> tuple[Array32, Array32, Mask]:
-    """Return columns and rows [px] of the sphere at a camera's pixels (height, width), and which show any."""
+def _sphere_pixels(camera: Camera, width: int, R_lens_from_cam: Array) -> tuple[Array32, Array32, Mask]:
+    """Return the sphere's column and row [px] at each pixel of a camera, and which pixels have a ray.
+
+    All three are (height, width); the sphere's picture is `width` [px] wide.
+    """
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays, is_in = camera.rays(np.stack([u, v], axis=-1))
     columns, rows = compute_pixels(rays @ R_lens_from_cam, width)

@@ -1,6 +1,6 @@
-"""The points that a camera sees around it, as fine as its pixels: for the last millimetres.
+"""The points that a camera sees around it, as fine as its pixels, for the last descents.
 
-Views are rendered from places on a grid, and the last few are kept: a pose that hardly moves uses them again.
+Views are rendered from places on a fine grid, and the last few are kept: poses near each other share them.
 """
 
 from collections.abc import Callable
@@ -31,13 +31,13 @@ from .view import (
 from .zbuffer import VISIBLE_OFFSET
 
 LOW_32 = np.uint64(0xFFFFFFFF)
-FILLED = 0.97  # of the room for points; the rest is for chance
-PLACE_SPACING = 0.01  # [m] between places
-NUM_KEPT_VIEWS = 32  # are kept: 12 MB
-NUM_POINT_SETS = 8  # 7 MB
-NUM_SURROUNDINGS = 2  # 11 MB
+FILLED = 0.97  # of the room for points, in the mean: their number is random
+PLACE_SPACING = 0.01  # [m] between the places from which views are rendered
+NUM_KEPT_VIEWS = 32  # views that are kept, 12 MB
+NUM_POINT_SETS = 8  # sets of visible points that are kept, 7 MB
+NUM_SURROUNDINGS = 2  # sets of points in all directions that are kept, 11 MB
 
-Place = tuple[float, float, float]  # [m]
+Place = tuple[float, float, float]  # [m] in the map
 
 
 @inline_kernel
@@ -53,9 +53,10 @@ def node_fraction(node: int) -> np.float32:
 def keep_visible(
     tree: Octree, nodes: Int32s, cells: Int32s, ranges: Array32, limits: Array32
 ) -> tuple[int, int]:
-    """Move the visible nodes to the front; return their number, and that of their children.
+    """Move the visible nodes to the front of `nodes`; return their number, and that of their children.
 
-    A node is visible up to the range in column 7 of `limits` (cells, 8). One without children counts as one.
+    A node is visible up to the range [m] in column 7 of `limits` (cells, 8). A node without children counts
+    as its own child.
     """
     count = num_children = 0
     for i in range(len(cells)):
@@ -69,10 +70,10 @@ def keep_visible(
 
 @inline_kernel
 def take_children(tree: Octree, nodes: Int32s, kept: np.float32, found: Int32s) -> int:
-    """Write some children of nodes, each kept with the probability `kept`; return their number.
+    """Write a sample of the nodes' children, each with the probability `kept`; return their number.
 
-    A node without children stands for itself. A node's hash decides whether it is kept, so that a camera a
-    little farther on sees nearly the same points: a descent that starts again where it ended then ends there.
+    A node without children counts as its own child. A hash of its index decides whether a child is kept, so
+    that nearby cameras get nearly the same points: a descent that starts again where it ended stays there.
     """
     count = 0
     for i in range(len(nodes)):
@@ -98,10 +99,11 @@ def sample_visible(
     scratch: Scratch,
     sample: Cells,
 ) -> int:
-    """Write a sample of the visible points in cells that are shown, all in a cone; return their number.
+    """Write a sample of the visible points in the cells of a mask (cells,); return their number.
 
-    It fits the arrays of `sample`. Offsets and channels are as in `normalize_cells`, weights are 1. Occlusion
-    and local statistics are computed from voxels twice as large.
+    The mask's cells lie in the cone, in the map's frame. There are no more points than the arrays hold.
+    Offsets and channels are as in `normalize_cells`, weights are 1. Occlusion and local statistics are
+    computed from voxels twice as large.
     """
     offsets, channels, weights, center = sample
     s = scratch
@@ -113,7 +115,7 @@ def sample_visible(
     cell_weights = np.empty(num_cells, np.float32)
     n = average_nodes(tree, center, 2.0 * voxel_per_range, view, cone, scratch, sums)
     describe_cells(sums, view, shown, cell_offsets, cell_channels, cell_weights, stats)
-    for c in range(num_cells):  # how far what is seen reaches; nothing of cells that are not shown
+    for c in range(num_cells):  # the range up to which points are visible; 0 in other cells
         sums[c, 7] = sums[c, 7] * view.visible + VISIBLE_OFFSET if cell_weights[c] > F0 else F0
     n, num_visible = keep_visible(tree, s.nodes, s.cells[:n], s.ranges, sums)
     kept = np.float32(FILLED * len(weights) / max(num_visible, 1))
@@ -146,10 +148,10 @@ def sample_visible(
 def sample_visible_points(
     octree: Octree, center_map: Center, config: ViewConfig, shown: bytes, cone: Cone, count: int
 ) -> Cells:
-    """Return what is seen from a centre (3,) [m] as at most `count` points of equal weights, not as cells.
+    """Return at most `count` points that are visible from a centre (3,) [m], with equal weights.
 
-    `shown` has a byte for each cell of `config`: 1 if points in it are wanted, else 0. These cells lie in a
-    cone, in the map's frame.
+    `shown` has a byte for each cell of `config`: 1 if points in it are wanted, else 0. The wanted cells lie
+    in the cone, in the map's frame.
     """
     sample = empty_cells(count, center_map)
     is_shown = np.frombuffer(shown, np.bool_)
@@ -160,10 +162,10 @@ def sample_visible_points(
 
 
 def points_around(octree: Octree, center_map: Center, voxel_per_range: float) -> PackedPoints:
-    """Return nodes in all directions from a centre (3,) [m], hidden or not, as coloured points.
+    """Return the scan in all directions from a centre (3,) [m], hidden or not, as coloured points.
 
-    Voxels are at most `voxel_per_range` times their distance wide. There are some hundred thousand points,
-    however large the scan.
+    They are voxels at most `voxel_per_range` times their distance wide: some hundred thousand points, however
+    large the scan.
     """
     scratch = thread_scratch()
     center = np.asarray(center_map, np.float64)
@@ -174,10 +176,10 @@ def points_around(octree: Octree, center_map: Center, voxel_per_range: float) ->
 
 
 class RecentViews:
-    """The last few views of one scan, each rendered when it is asked for and not kept; from any thread."""
+    """Views of one scan; the last few are kept, others are rendered. Threads may share this."""
 
     def __init__(self, octree: Octree, averaged: Octree | None = None) -> None:
-        """Prepare for views of an octree; averages are of another one, if it is given."""
+        """Take the octree that is rendered, and optionally another one for `averages`."""
         self.averages: Callable[[Place, ViewConfig, Cone], Array32] = lru_cache(NUM_KEPT_VIEWS)(
             partial(average_view, averaged or octree)
         )
@@ -190,6 +192,6 @@ class RecentViews:
 
 
 def round_position(pose: Pose) -> Place:
-    """Return the place [m] on the grid that is nearest to a pose in the map."""
+    """Return the place on the grid [m] that is nearest to a pose's centre, in the map."""
     x, y, z = (round(float(value) / PLACE_SPACING) * PLACE_SPACING for value in pose.center_world)
     return x, y, z

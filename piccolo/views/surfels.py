@@ -1,8 +1,9 @@
-"""The cloud rendered at a pose as surfels: discs that close the surface between points, of their neighbours.
+"""The cloud rendered at a pose as surfels: discs around points, large enough to close the surface.
 
-They are drawn into rows of an equirectangular picture: nearest range first, then weighted colours near it. A
-pixel's ray sees a surfel where it meets the disc's plane within the radius; a surfel smaller than a pixel is
-seen by the ray nearest to it.
+A disc is fitted to a point and its nearest neighbours. Discs are drawn into an equirectangular picture twice:
+first to find the nearest range of each pixel, then to add up weighted colours near that range. A pixel's ray
+sees a surfel if it meets the disc's plane within the radius; a surfel smaller than a pixel is seen by the ray
+nearest to it.
 """
 
 import math
@@ -22,41 +23,41 @@ from ..system.kernels.jit import F0, F1, Scalar, inline_kernel, kernel
 from .zbuffer import Coordinates, View, indices_in_front, nearest_depth
 
 NUM_SURFEL_NEIGHBORS = 10
-SURFEL_CHUNK = 65_536
-RADIUS_PER_REACH = 0.8  # surfel radius by the distance of the farthest of these neighbours
+SURFEL_CHUNK = 65_536  # points that one task fits
+RADIUS_PER_REACH = 0.8  # surfel radius, divided by the distance of the farthest of these neighbours
 # A ray that grazes an edge leaves points in the air behind it. Such a point is farther from its neighbours
 # than they are from theirs.
-MAX_REACH = 1.6  # by the median of the neighbours' own
-MIN_FLATNESS = 0.05  # second to largest eigenvalue; below, neighbours lie in a line and tell no plane
-MAX_THICKNESS = 0.12  # smallest eigenvalue by the sum of all; of a ball, such as leaves, it is 1/3
-THICK_RADIUS = 0.25  # so much smaller are surfels that are no part of a surface
+MAX_REACH = 1.6  # largest radius, divided by the median of the neighbours' radii
+MIN_FLATNESS = 0.05  # second eigenvalue to the largest; below, neighbours are on a line: no plane
+MAX_THICKNESS = 0.12  # smallest eigenvalue to the sum of all three; for a ball, such as leaves, it is 1/3
+THICK_RADIUS = 0.25  # factor of the radius of surfels that are not part of a surface
 MIN_RADIUS_PX = np.float32(0.75)  # every surfel reaches the centre of a pixel
-# Layers nearer to each other than this are one surface: noise of a scanner.
+# Points up to this times the nearest range, and the offset, are one surface: noise of a scanner.
 SURFACE_BAND = np.float32(1.01)
 BAND_OFFSET = np.float32(0.02)  # [m]
-LEAST_RIM_WEIGHT = np.float32(1e-4)  # at the rim: whatever is seen has a colour
-MAX_SLOPE = np.float32(1.25)  # of the range within a surfel or a pixel
+LEAST_RIM_WEIGHT = np.float32(1e-4)  # weight at the rim, above 0 so that every pixel seen has a colour
+MAX_SLOPE = np.float32(1.25)  # largest ratio of ranges within a surfel or a pixel
 PIXELS_AT_ONCE = 1 << 21  # pixels that one thread draws at a time
-MAX_SURFELS = 8_000_000  # of more points that may be seen, this many are drawn, evenly in space
-MAX_SURFEL_ANGLE = 0.3  # [rad] as which a surfel's radius is seen, at most
-MIN_COSINE = 0.15  # a surfel seen flatter than this is turned towards the camera: normals are not that sure
-# Rooms behind gaps leave lone points with large surfels. Large surfels far off are sparse surfaces.
-MAX_RADIUS = 1.5  # by the radius that 95 % of the surfels stay below
-MIN_RANGE = 1e-3  # [m] nearer to the camera nothing is drawn
+MAX_SURFELS = 8_000_000  # if more points may be seen, only so many are drawn, evenly in space
+MAX_SURFEL_ANGLE = 0.3  # [rad] largest angle of a surfel's radius
+MIN_COSINE = 0.15  # a surfel seen at a flatter angle is turned towards the camera: normals have errors
+# Rooms behind gaps leave lone points with large surfels, which are not drawn; far away, surfaces are sparse.
+MAX_RADIUS = 1.5  # largest radius, divided by the radius that 95 % of the surfels stay below
+MIN_RANGE = 1e-3  # [m] nothing nearer to the camera is drawn
 HIDING_WIDTHS = (360, 720)  # cells of 1 and 1/2 degrees; wider ones hide what is seen through a door ajar
-NOWHERE = np.float32(-1.0)  # extent of what is not drawn: no pixel is within -1
-FAR_ANGLE = 0.02  # [rad] as which a far surfel's radius is seen
+NOWHERE = np.float32(-1.0)  # extent of a surfel that is not drawn: no pixel is within -1 of it
+FAR_ANGLE = 0.02  # [rad] up to this angle a surfel's radius may be larger than MAX_RADIUS allows
 
-# of a surfel in the camera's frame: centre [m], normal, product of both, 1 / radius^2, range [m]
+# a surfel in the camera's frame: centre [m], normal, their dot product, 1 / radius^2, range [m]
 Disc = tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
 
 
 class Surfels(NamedTuple):
-    """Coloured discs around points."""
+    """Coloured discs around N points."""
 
     points: PackedPoints
-    normals: Array32  # (N, 3) unit, of either sign; 0 without a plane: faces the camera
-    radii: Array32  # (N,) [m], 0 for a surfel no larger than a pixel
+    normals: Array32  # (N, 3) unit, of either sign; 0 if there is no plane: the disc faces the camera
+    radii: Array32  # (N,) [m], 0 for a surfel that is always drawn one pixel large
 
     def take(self, indices: NDArray[np.integer]) -> "Surfels":
         """Return the surfels at `indices`, in that order."""
@@ -65,7 +66,7 @@ class Surfels(NamedTuple):
 
 def make_surfels(points: PackedPoints, workers: Workers) -> Surfels:
     """Fit a surfel to each point and its nearest neighbours; leave out points in the air."""
-    from scipy.spatial import cKDTree  # noqa: PLC0415  # who draws no picture need not wait for it
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # imported only when a picture is drawn
 
     positions = points.stack()
     normals = np.zeros_like(positions)
@@ -90,7 +91,10 @@ def make_surfels(points: PackedPoints, workers: Workers) -> Surfels:
 
 
 def planes(neighborhoods: Array32) -> tuple[Array32, Mask]:
-    """Return unit normals (N, 3) of neighbourhoods (N, K, 3), 0 without a plane, and which are thick (N,)."""
+    """Return the unit normals (N, 3) of neighbourhoods (N, K, 3), and a mask (N,) of those that are thick.
+
+    The normal is 0 if the neighbours lie in no plane.
+    """
     offsets = neighborhoods - neighborhoods.mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
     is_thick = values[:, 0] > MAX_THICKNESS * values.sum(axis=1)
@@ -102,8 +106,8 @@ def planes(neighborhoods: Array32) -> tuple[Array32, Mask]:
 def hit(surfel: Disc, dx: Scalar, dy: Scalar, dz: Scalar, px_angle2: Scalar) -> tuple[Scalar, Scalar]:
     """Intersect a unit ray (dx, dy, dz) with a surfel's plane; return (distance / radius)^2 and range [m].
 
-    The distance is that of the intersection from the surfel's centre. `px_angle2` is the square of the
-    least radius [rad]: a ray nearer to the centre meets the surfel, however small.
+    The distance is that of the intersection from the surfel's centre. `px_angle2` is the square of the least
+    radius [rad^2]: a ray nearer to the centre meets the surfel, however small it is.
     """
     x, y, z, nx, ny, nz, along, per_radius2, distance = surfel
     facing = nx * dx + ny * dy + nz * dz
@@ -112,7 +116,7 @@ def hit(surfel: Disc, dx: Scalar, dy: Scalar, dz: Scalar, px_angle2: Scalar) -> 
     if not facing * along > F0:  # a plane along the ray divides by zero: NaN is no hit
         q = F1 + F1
         t = distance
-    # What the ray meets beside the surfel, in the same pixel: the surface goes on, but nobody knows how far.
+    # A ray that misses the disc within the pixel: the surface goes on, but its range there is not known.
     t = min(max(t, distance / MAX_SLOPE), distance * MAX_SLOPE)
     gap2 = (dx - x / distance) ** 2 + (dy - y / distance) ** 2 + (dz - z / distance) ** 2
     return min(q, gap2 / px_angle2), t
@@ -129,12 +133,12 @@ def splat(
     depth: Array32,
     sums: Array32,
 ) -> None:
-    """Draw surfels into the rows from `first_row` on: into `depth`, or into `sums` if it is not empty.
+    """Draw surfels into n rows of a picture from `first_row` on: ranges first, then colours.
 
-    surfels (N, 9) and extents (N, 4) are those of `pack_discs`; columns (W, 2), rows (W / 2, 2): cosines
-    and sines of azimuths and elevations. The nearest range [m] is written into depth (n, W), which holds inf
-    before; then sums (n, W, 5) gets R, G, B [8-bit levels], range [m] and 1 of what is near that range, each
-    times a weight, added.
+    `surfels` (N, 9) and `extents` (N, 4) are those of `pack_discs`. `columns` (W, 2) and `rows` (W / 2, 2)
+    are cosines and sines of azimuths and elevations. If `sums` is empty, `depth` (n, W), which holds inf
+    before, gets the nearest range [m]. Else `depth` is read, and `sums` (n, W, 5) gets the weighted sums of
+    R, G, B [8-bit levels], range [m] and 1 over the surfels near that range.
     """
     width = depth.shape[1]
     px_angle2 = np.float32((MIN_RADIUS_PX * 2.0 * math.pi / width) ** 2)
@@ -176,17 +180,17 @@ def axes_of_pixels(width: int) -> tuple[Array32, Array32]:
 
 
 def render_points(points: PackedPoints, pose: Pose, width: int, workers: Workers) -> View:
-    """Render the cloud as surfels at a pose, (width / 2, width) pixels; colours in uint8."""
+    """Render the cloud as surfels at a pose, a sphere of (width / 2, width) pixels; colours are uint8."""
     visible = points.take(visible_indices(points, pose.center_world)).subsample(MAX_SURFELS)
     return render_surfels(make_surfels(visible, workers), pose, width, workers)
 
 
 def visible_indices(points: PackedPoints, center_world: Array) -> Int64s:
-    """Return the indices of all points but those behind a surface that goes on around them.
+    """Return the indices of the points that no surface hides, seen from a centre (3,) [m].
 
-    In `visible_points` the nearest point of a cell hides the whole cell: a picture would lack a rim of two
-    degrees around each object. Here a point is hidden only if it is behind the nearest point of each of nine
-    cells around it, in one of two cell sizes.
+    In `visible_points` the nearest point of a cell hides all that is behind it in the cell: a picture would
+    lack a rim of two degrees around each object. Here a point is hidden only if it is behind the nearest
+    points of all nine cells around it, for cells of one of two sizes.
     """
     kept = np.arange(len(points))
     for width in HIDING_WIDTHS:
@@ -201,7 +205,7 @@ def visible_indices(points: PackedPoints, center_world: Array) -> Int64s:
 
 
 def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -> View:
-    """Render surfels at a pose, (width / 2, width) pixels; colours in uint8."""
+    """Render surfels at a pose, a sphere of (width / 2, width) pixels; colours are uint8."""
     packed, extents = pack_discs(surfels, pose, width)
     columns, rows = axes_of_pixels(width)
     rgb = np.zeros((width // 2, width, 3), np.uint8)
@@ -246,11 +250,11 @@ def place_discs(
     surfels: Array32,
     extents: Array32,
 ) -> None:
-    """Write surfels (N, 9) in the camera's frame, and which pixels they can reach (N, 4).
+    """Write surfels (N, 9) in the camera's frame, and their extents (N, 4) in the picture.
 
-    The nine numbers are centre [m], normal, product of both, 1 / radius^2 and range [m]; the extents are
-    column and row of the centre, and how far the disc reaches across columns and rows [px]. A surfel that is
-    too near, or larger than `largest` [m] and not far off, reaches none.
+    The nine numbers are those of `Disc`. An extent is column and row of the centre, and how far the disc
+    reaches from there across columns and across rows [px]. The extent of a surfel that is too near, or larger
+    than `largest` [m] and not far away, is NOWHERE.
     """
     R = R_cam_from_world
     step = math.tau / width
@@ -282,7 +286,7 @@ def place_discs(
         disc[8] = distance
         level = math.hypot(disc[0], disc[1])
         angle = max(math.asin(radius / distance), least)
-        sine = math.sin(angle) * distance  # over the level part of the range: that of the azimuth, of a cap
+        sine = math.sin(angle) * distance  # divided by `level`, the sine of a cap's half width in azimuth
         extents[n, 0], extents[n, 1] = direction_to_pixel(disc[0], disc[1], disc[2], level, width)
         extents[n, 2] = (math.asin(sine / level) if sine < level else math.pi) / step
         extents[n, 3] = angle / step

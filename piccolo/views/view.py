@@ -1,4 +1,4 @@
-"""The cloud seen from a position: z-buffered cells of the sphere, from voxels as fine as the cells ask."""
+"""The cloud seen from a position: z-buffered cells of the sphere, by voxels as fine as the cells."""
 
 import math
 import threading
@@ -19,17 +19,17 @@ from .drawn_edges import replace_by_edges
 from .zbuffer import VISIBLE_FACTOR
 
 VIEWS_A_TASK = 64  # views that a thread makes at a time
-FAR_RANGE = np.float32(1e30)
+FAR_RANGE = np.float32(1e30)  # [m] of a cell in which nothing is seen
 
 Center = Sequence[float] | Array
 
 
 class Cells(NamedTuple):
-    """Surfaces of the scan seen from a centre, on cells of the sphere or as points."""
+    """Surfaces of the scan seen from a centre: one for each of N cells of the sphere, or N points."""
 
     offsets: Array32  # (3, N) [m] from the centre
     channels: Array32  # (3, N) opponent colours, locally normalised [standard deviations]
-    weights: Array32  # (N,) fraction of the sphere; 0 where nothing is seen; 1 of a point
+    weights: Array32  # (N,) a cell's fraction of the sphere, 0 if nothing is seen in it; a point's is 1
     center_map: Array  # (3,) [m]
 
     def around(self, center_map: Array) -> "Cells":
@@ -41,42 +41,42 @@ class Cells(NamedTuple):
 class ViewArrays(NamedTuple):
     """A view's configuration as kernels read it."""
 
-    num_columns: Int32s  # (rings,) of the cells
+    num_columns: Int32s  # (rings,) number of cells in each ring
     first: Int32s  # (rings,) index of each ring's first cell
-    stats_cell: Int32s  # (cells,) the wider cell that each lies in
-    num_stats: int  # wider cells
+    stats_cell: Int32s  # (cells,) index of the wider cell in which each lies
+    num_stats: int  # number of wider cells, which hold the local statistics
     solid_angle: Array32  # (cells,) fraction of the sphere
-    neighbor_row: Int32s  # (wider cells + 1,) where each wider cell's neighbours begin
-    neighbor_cell: Int32s  # wider cells
-    neighbor_weight: Array32
-    near_stats: Int32s  # (cells, 4) wider cells around each cell's middle
-    near_weight: Array32  # (cells, 4) of each: bilinear
-    front: np.float32
-    visible: np.float32
-    blocks: Int32s  # (cells,) the block of the sphere that each lies in, for scores
+    neighbor_row: Int32s  # (wider cells + 1,) index of each wider cell's first neighbour in the next two
+    neighbor_cell: Int32s  # indices of wider cells
+    neighbor_weight: Array32  # their Gaussian weights
+    near_stats: Int32s  # (cells, 4) the wider cells around each cell's middle
+    near_weight: Array32  # (cells, 4) their bilinear weights
+    front: np.float32  # as in ViewConfig
+    visible: np.float32  # as in ViewConfig
+    blocks: Int32s  # (cells,) index of the block of the sphere in which each lies, for scores
 
 
 class Scratch(NamedTuple):
-    """Arrays that one thread needs to render."""
+    """Arrays that one thread needs to render, with room for N nodes of the octree."""
 
-    nodes: Int32s
-    directions: Array32  # (3, N)
-    cells: Int32s
-    ranges: Array32
-    turns: Array32
+    nodes: Int32s  # (N,)
+    directions: Array32  # (3, N) [m] from the centre
+    cells: Int32s  # (N,)
+    ranges: Array32  # (N,) [m]
+    turns: Array32  # (N,)
 
 
 @dataclass(frozen=True)
 class ViewConfig:
     """Settings of a view: its cells, the neighbourhood that normalises colours, the voxels' angular size."""
 
-    num_rings: int
-    stats_rings: int  # cells of these rings carry the local statistics: no wider than sigma
-    sigma_deg: float
-    voxel_per_range: float  # largest voxel size by its distance
+    num_rings: int  # of cells from pole to pole
+    stats_rings: int  # rings of the wider cells that hold the local statistics: cells no wider than sigma
+    sigma_deg: float  # of the Gaussian over which colours are normalised
+    voxel_per_range: float  # largest voxel, divided by its distance
     front: float = 1.15  # a cell's colour is the mean of points up to this times its nearest range
-    visible: float = float(VISIBLE_FACTOR)  # a point is seen up to this times it and VISIBLE_OFFSET
-    draws_edges: bool = False  # in place of colours, by the ranges of the view
+    visible: float = float(VISIBLE_FACTOR)  # a point is seen up to this times it, plus VISIBLE_OFFSET
+    draws_edges: bool = False  # edges, found in the view's ranges, replace the colours
 
     @cached_property
     def arrays(self) -> ViewArrays:
@@ -110,11 +110,14 @@ def locate(
     ranges: Array32,
     turns: Array32,
 ) -> None:
-    """Write the cell and the range [m] of each position relative to the centre; `turns` is scratch."""
+    """Write the cell and the range [m] of each position X, Y, Z [m] relative to the centre.
+
+    `turns` is overwritten with the azimuths, in turns.
+    """
     num_rings = np.float32(len(num_columns))
     per_pi = np.float32(len(num_columns) / math.pi)
     per_turn = np.float32(0.5 / math.pi)
-    # Two loops: the arithmetic is vectorised, the look-ups that follow can't be.
+    # Two loops: the arithmetic is vectorised, the look-ups in the second loop can't be.
     for i in range(len(cells)):
         x = X[i]
         y = Y[i]
@@ -137,7 +140,7 @@ def locate_nodes(
     """Fill the scratch with the nodes to draw, their offsets, cells and ranges; return their number."""
     s = scratch
     n = collect(tree, center, voxel_per_range, cone, s.nodes, s.directions)
-    x = s.directions[0, :n]  # a row each: of a cut of all three, the stride is unknown to the compiler
+    x = s.directions[0, :n]  # row by row: in a slice of all three rows the compiler does not know the stride
     y = s.directions[1, :n]
     z = s.directions[2, :n]
     locate(x, y, z, view.num_columns, view.first, s.cells[:n], s.ranges[:n], s.turns)
@@ -154,11 +157,11 @@ def average_nodes(
     scratch: Scratch,
     sums: Array32,
 ) -> int:
-    """Write (cells, 8): sums of x, y, z, r, g, b, and the count, of each cell's nearest nodes; and its range.
+    """Write the sums (cells, 8) over each cell's nearest nodes: x, y, z, r, g, b, count; and the least range.
 
-    Positions are relative to the centre [m], colours in [0, 1]. Nearest nodes are those up to `view.front`
-    times the range [m] of the very nearest. Cells of which a part lies outside of the cone may miss some.
-    All nodes stay in the scratch; their number is returned.
+    Positions are relative to the centre [m], colours in [0, 1]. A cell's nearest nodes are those up to
+    `view.front` times its least range [m]. Cells that lie partly outside of the cone may miss some nodes. All
+    nodes in the cone stay in the scratch; their number is returned.
     """
     n = locate_nodes(tree, center, voxel_per_range, view, cone, scratch)
     s = scratch
@@ -189,7 +192,11 @@ def average_colors(
     weights: Array32,
     moments: Array32,
 ) -> None:
-    """Write relative positions, opponent channels and weights of the cells shown; add up their moments."""
+    """Write mean positions, opponent channels and weights of the cells in a mask, and add up their moments.
+
+    Positions [m] are relative to the centre. All are 0 in other cells. The moments are those that
+    `cell_statistics` reads: weight, weighted channels and weighted squares by wider cell (wider cells, 8).
+    """
     moments[:] = F0
     for c in range(len(sums)):
         if shown[c] and sums[c, 6] > F0:
@@ -214,9 +221,9 @@ def average_colors(
 
 @kernel
 def cell_statistics(moments: Array32, view: ViewArrays, weights: Array32, stats: Array32) -> None:
-    """Write the local means of the channels and 1 / deviations (6, cells) around cells of positive weight.
+    """Write the local means (3) and inverse deviations (3) of the channels (6, cells) at cells with a weight.
 
-    Taken at the wider cells that hold the moments, and interpolated between these.
+    They are computed at the wider cells, from the moments of these and their neighbours, and interpolated.
     """
     coarse = np.zeros((view.num_stats, 8), np.float32)
     around = np.empty(8, np.float32)
@@ -245,7 +252,7 @@ def cell_statistics(moments: Array32, view: ViewArrays, weights: Array32, stats:
             b = coarse[near[1]]
             d = coarse[near[2]]
             e = coarse[near[3]]
-            for k in range(8):  # two of them 0, as above; and stored apart, or each is read for itself
+            for k in range(8):  # eight as above; into `around`, or the compiler reads one by one
                 around[k] = w[0] * a[k] + w[1] * b[k] + w[2] * d[k] + w[3] * e[k]
             for k in range(6):
                 stats[k, c] = around[k]
@@ -261,7 +268,7 @@ def describe_cells(
     weights: Array32,
     stats: Array32,
 ) -> None:
-    """Write position, opponent channels, weight and local statistics of each cell shown, from its sums."""
+    """Write mean position, opponent channels, weight and local statistics of each cell in a mask."""
     moments = np.empty((view.num_stats, 8), np.float32)
     average_colors(sums, view, shown, offsets, channels, weights, moments)
     cell_statistics(moments, view, weights, stats)
@@ -271,7 +278,7 @@ def describe_cells(
 def normalize_cells(
     sums: Array32, view: ViewArrays, shown: Mask, offsets: Array32, channels: Array32, weights: Array32
 ) -> None:
-    """Write position, locally normalised channels and weight of each cell shown, from its sums."""
+    """Write mean position, locally normalised channels and weight of each cell in a mask."""
     stats = np.empty((6, len(weights)), np.float32)
     describe_cells(sums, view, shown, offsets, channels, weights, stats)
     for k in range(3):
@@ -284,7 +291,10 @@ def normalize_cells(
 def nearest_node_ranges(
     tree: Octree, centers: Floats, voxel_per_range: float, view: ViewArrays, scratch: Scratch, ranges: Array32
 ) -> None:
-    """Write ranges [m] of the nearest nodes in the cells (n, cells) around each centre (n, 3), 0 for none."""
+    """Write the range [m] of the nearest node in each cell around each centre: (n, cells), 0 without a node.
+
+    `centers` (n, 3) [m] are in the map's frame.
+    """
     for k in range(len(centers)):
         n = locate_nodes(tree, centers[k], voxel_per_range, view, EVERYWHERE, scratch)
         ranges[k] = F0
@@ -298,7 +308,7 @@ _local = threading.local()
 
 
 def thread_scratch() -> Scratch:
-    """Return the calling thread's own scratch, for the largest view: fresh memory costs as much as a view."""
+    """Return the calling thread's scratch, kept for all views: to allocate it takes as long as a view."""
     if not hasattr(_local, "scratch"):
         nodes, cells = np.empty((2, MAX_NODES), np.int32)
         floats = np.empty((5, MAX_NODES), np.float32)
@@ -310,7 +320,7 @@ def thread_scratch() -> Scratch:
 def average_view(octree: Octree, center_map: Center, config: ViewConfig, cone: Cone = EVERYWHERE) -> Array32:
     """Render a view from a centre (3,) [m]; return its sums (cells, 8) as `average_nodes` writes them.
 
-    Only the cells in a cone, in the map's frame, are needed.
+    Only the cells inside the cone, in the map's frame, are complete.
     """
     sums = np.empty((len(make_grid(config.num_rings)), 8), np.float32)
     center = np.asarray(center_map, np.float64)
@@ -321,21 +331,21 @@ def average_view(octree: Octree, center_map: Center, config: ViewConfig, cone: C
 
 
 def empty_cells(n: int, center_map: Center) -> Cells:
-    """Return arrays, not filled, for `n` cells or points around a centre (3,) [m]."""
+    """Return uninitialised arrays for `n` cells or points around a centre (3,) [m]."""
     offsets, channels = np.empty((2, 3, n), np.float32)
     return Cells(offsets, channels, np.empty(n, np.float32), np.asarray(center_map, np.float64))
 
 
 def normalize_view(sums: Array32, center_map: Center, config: ViewConfig, shown: Mask) -> Cells:
-    """Normalise a view from a centre (3,) [m], given its sums (N, 8); cells not shown (N,) weigh 0."""
+    """Normalise a view from a centre (3,) [m], given its sums (N, 8); the weight is 0 outside a mask (N,)."""
     cells = empty_cells(len(sums), center_map)
     normalize_cells(sums, config.arrays, shown, *cells[:3])
     return cells
 
 
 def ranges_around(octree: Octree, centers_map: Floats, config: ViewConfig) -> Array32:
-    """Return the range [m] of the nearest node in each cell around each centre: (n, cells), 0 for none."""
+    """Return the range [m] of the nearest node in each cell around each centre (n, 3): (n, cells), or 0."""
     ranges = np.empty((len(centers_map), len(make_grid(config.num_rings))), np.float32)
-    centers_map = np.ascontiguousarray(centers_map)  # one kernel for all
+    centers_map = np.ascontiguousarray(centers_map)  # so that the kernel is compiled once
     nearest_node_ranges(octree, centers_map, config.voxel_per_range, config.arrays, thread_scratch(), ranges)
     return ranges

@@ -1,4 +1,4 @@
-"""Grey pictures of the scan from a position, to find keypoints in: surfaces closed, small gaps filled."""
+"""Grey pictures of the scan at a pose, in which keypoints are found: surfaces closed, small gaps filled."""
 
 import math
 from typing import Any, Literal, NamedTuple
@@ -16,25 +16,25 @@ from ..system.kernels.jit import F0, F1, HALF, Scalar, inline_kernel, kernel
 from .view import Scratch, thread_scratch
 
 DRAWN_VOXEL_PER_RANGE = 1.0 / 80.0  # largest voxel, divided by its distance
-DRAWN_REACH = np.float32(0.7)  # half width of what is drawn for a voxel, divided by the voxel's width
-LEAST_REACH = np.float32(0.75)  # [px]
-MOST_REACH = np.float32(12.0)
-FRONT = np.float32(1.05)  # a pixel's grey is the mean up to this times its nearest range,
-FRONT_OFFSET = np.float32(0.05)  # [m] and this
-HIDDEN_BEHIND = np.float32(1.2)  # a pixel all of whose surroundings are nearer by this factor is hidden
-WIDER_PIXEL = 4  # [px] of a wider pixel
+DRAWN_REACH = np.float32(0.7)  # half the width of the square drawn for a voxel, divided by the voxel's width
+LEAST_REACH = np.float32(0.75)  # [px] half of that square's width, at least
+MOST_REACH = np.float32(12.0)  # [px] and at most
+FRONT = np.float32(1.05)  # a pixel's grey is the mean of voxels up to this times its nearest range,
+FRONT_OFFSET = np.float32(0.05)  # [m] plus this
+HIDDEN_BEHIND = np.float32(1.2)  # a pixel is hidden if all wider pixels around it are nearer by this factor
+WIDER_PIXEL = 4  # [px] width of a wider pixel
 FILL_LEVELS = 4  # gaps up to 16 px are filled
-LEAST_FILLED_PIXEL = 0.25  # of a wider pixel that fills finer ones
-NOTHING_NEAR = np.float32(1e30)
-CONE_ROUNDING = 1e-3  # [rad] of a cone in float32
-NEAREST = np.float32(0.1)  # cosine of the angle between a pinhole's axis and what it shows, at least
+LEAST_FILLED_PIXEL = 0.25  # fraction of a wider pixel that must be known to fill finer ones
+NOTHING_NEAR = np.float32(1e30)  # [m] range of a pixel in which nothing is seen
+CONE_ROUNDING = 1e-3  # [rad] margin of a cone for rounding to float32
+NEAREST = np.float32(0.1)  # least cosine of the angle between a pinhole's axis and what it shows
 
 
 class ViewImage(NamedTuple):
     """The scan seen from a pose: a sphere's or a pinhole's picture, in the camera's axes."""
 
     gray: Bytes  # (H, W)
-    is_filled: Mask  # (H, W) where the grey means something
+    is_filled: Mask  # (H, W) where the grey is known: seen, or filled from around
     ranges: Array32  # (H, W) [m], 0 where nothing is seen
 
 
@@ -42,10 +42,11 @@ class ViewImage(NamedTuple):
 def project_direction(
     x: Scalar, y: Scalar, z: Scalar, r: Scalar, focal: Scalar, height: int, width: int
 ) -> tuple[Any, Any, Any, Any]:
-    """Return the pixel u, v of a direction of length r, the pixels a radian there, and its radius.
+    """Return the pixel (u, v) of a direction of length r, pixels per radian there, and a radius.
 
-    `focal` [px] is a pinhole's, whose pixel is (-1, -1) behind it, and the radius r. With 0 the picture is
-    the sphere's, stretched across by r / radius.
+    A voxel is drawn wider than high by r / radius. For a pinhole with focal length `focal` [px] the radius is
+    r, and the pixel of a direction behind the camera is (-1, -1). If `focal` is 0, the picture is the
+    sphere's, which stretches across towards the poles: the radius is the distance from the vertical axis.
     """
     if focal > F0:
         if x < NEAREST * r:
@@ -67,12 +68,11 @@ def project_voxels(
     cone: Cone,
     scratch: Scratch,
 ) -> int:
-    """Project the voxels whose middles a mask (H, W) of the picture shows, and return their number.
+    """Project the voxels whose middles are in the mask (H, W) of the picture; return their number.
 
-    What it shows lies in the cone, in the map's frame.
-
-    Of each voxel `scratch` gets the node, as `directions` the pixel u, v and the range, and as `ranges` and
-    `turns` half of the height and of the width that is drawn for it [px].
+    The cone, in the map's frame, contains all that the mask shows. For each voxel the arrays of `scratch`
+    get: `nodes` the node; `directions` the pixel u, v and the range [m]; `ranges` and `turns` half the height
+    and half the width [px] of the rectangle drawn for it.
     """
     height, width = is_drawn.shape
     nodes = scratch.nodes
@@ -139,7 +139,7 @@ def draw_voxels(
                         du = (np.float32(at) + HALF - u) / across
                         weight = max(F1 - HALF * (du * du + dv * dv), np.float32(0.02))
                         weight = weight * weight * weight
-                        node = tree.nodes[scratch.nodes[k]]  # here, as most voxels are hidden
+                        node = tree.nodes[scratch.nodes[k]]  # read only here, as most voxels are hidden
                         gray = (
                             np.float32(0.299) * node[3]
                             + np.float32(0.587) * node[4]
@@ -150,23 +150,25 @@ def draw_voxels(
 
 
 def is_in_front(ranges: Array32, wraps: bool = True) -> Mask:
-    """Return the mask (H, W) of the pixels that are not seen through a gap in a nearer surface.
+    """Return the mask (H, W) of the pixels that show a surface, not what lies behind a gap in a nearer one.
 
-    `ranges` (H, W) are the nearest, NOTHING_NEAR where there is none. A pixel is seen through a gap if every
-    wider pixel around it shows something much nearer.
+    `ranges` (H, W) [m] are the nearest, NOTHING_NEAR where nothing is seen. A pixel is behind a gap if all
+    wider pixels around it show something much nearer.
     """
     nearest = ranges[::WIDER_PIXEL, ::WIDER_PIXEL].copy()
     for i, j in np.ndindex(WIDER_PIXEL, WIDER_PIXEL):
         np.minimum(nearest, ranges[i::WIDER_PIXEL, j::WIDER_PIXEL], out=nearest)
-    beside: Literal["wrap", "edge"] = "wrap" if wraps else "edge"
-    around = np.pad(np.pad(nearest, ((0, 0), (1, 1)), mode=beside), ((1, 1), (0, 0)), mode="edge")
+    sides: Literal["wrap", "edge"] = "wrap" if wraps else "edge"
+    around = np.pad(np.pad(nearest, ((0, 0), (1, 1)), mode=sides), ((1, 1), (0, 0)), mode="edge")
     farthest = cv2.dilate(around, np.ones((3, 3), np.uint8))[1:-1, 1:-1]
     limit = np.repeat(np.repeat(farthest, WIDER_PIXEL, axis=0), WIDER_PIXEL, axis=1)
     return np.asarray((ranges < NOTHING_NEAR) & (ranges <= limit * HIDDEN_BEHIND))
 
 
 def fill_gaps(gray: Floats, weight: Floats) -> tuple[Floats, Mask]:
-    """Fill the gaps of a weighted grey picture (H, W) from around them; return also the mask of known grey.
+    """Fill the gaps of a grey picture (H, W) from around them; return it with the mask of the known pixels.
+
+    `gray` is multiplied by `weight` (H, W), which is 1 where a surface is seen and 0 in gaps.
 
     Pull and push over a pyramid of means (Gortler et al., "The Lumigraph", SIGGRAPH 1996, section 3.4.2).
     """
@@ -187,22 +189,22 @@ def fill_gaps(gray: Floats, weight: Floats) -> tuple[Floats, Mask]:
 
 
 def _resize_image(image: Floats, size: tuple[int, int]) -> Floats:
-    """Resize an image to (width, height): by means if that is smaller, else bilinearly."""
+    """Resize an image to (width, height): by means if it becomes smaller, else bilinearly."""
     how = cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(image, size, interpolation=how))
 
 
 def cone_of_picture(shape: tuple[int, int], focal: float) -> Cone:
-    """Return the cone around a pinhole's picture (H, W) with a focal length [px], in the camera's frame."""
+    """Return the cone, in the camera's frame, around a pinhole's picture (H, W) with a focal length [px]."""
     half_diagonal = 0.5 * math.hypot(*shape)
     return Cone(1.0, 0.0, 0.0, focal / math.hypot(focal, half_diagonal)).widen(CONE_ROUNDING)
 
 
 def render_gray(octree: Octree, pose: Pose, is_drawn: Mask, focal: float = 0.0) -> ViewImage:
-    """Draw the scan at a pose in the map, where the mask (H, W) says so, and a little beyond.
+    """Draw the scan at a pose in the map, where a mask (H, W) of the picture is True and a little beyond.
 
-    The picture is a pinhole's with the focal length `focal` [px], or the sphere's, W = 2 H, if it is 0. Sides
-    are multiples of 16 pixels.
+    The picture is a pinhole's with focal length `focal` [px], or the sphere's, W = 2 H, if `focal` is 0. H
+    and W must be multiples of 16.
     """
     scratch = thread_scratch()
     ranges = np.empty(is_drawn.shape, np.float32)

@@ -1,4 +1,4 @@
-"""The cloud seen from a pose: z-buffered views, which points the camera sees, whether it can stand there."""
+"""The cloud seen at a pose, by a z-buffer: views, visible points, and whether a camera can be there."""
 
 import math
 from typing import Any, NamedTuple
@@ -14,30 +14,30 @@ from ..system.arrays import Array, Array32, Int32s, Int64s, Mask
 from ..system.kernels.jit import kernel, whole
 
 Coordinates = tuple[Array32, Array32, Array32]  # x, y, z (N,) [m]
-DEPTH_CHUNK = 4096
+DEPTH_CHUNK = 4096  # points that a kernel projects at a time
 
-# A point is visible if it is not farther than the nearest in its cell by this much. The factor lets grazing
-# floors and walls through, whose ranges vary within a cell; the offset [m] covers range noise nearby. Of
-# cells and pixels of all sizes but those of surfels, which close the surface themselves, and of the picture
-# for keypoints, whose pixels are small: these have their own, with which their bits are known.
+# A point is visible up to this factor times the least range in its cell, plus this offset [m]. The factor
+# is for floors and walls seen at grazing angles, whose ranges vary within a cell; the offset is for noise
+# nearby. Surfels, which close the surface themselves, and pictures for keypoints, whose pixels are small,
+# have limits of their own.
 VISIBLE_FACTOR = np.float32(1.08)
 VISIBLE_OFFSET = np.float32(0.1)
 CELL_BAND = np.float32(1.0 + 0.15)  # a cell's colour is the mean of points up to this times its nearest range
 MIN_VIEW_WIDTH = 32  # [px] of a rendered view
 MAX_VIEW_WIDTH = 4096
-VISIBLE_WIDTH = 180  # cells of 2 degrees
-MIN_SEEN_FRACTION = 0.4  # of the sphere; less is seen from outside a scan
+VISIBLE_WIDTH = 180  # [cells] of 2 degrees, by which visible points are found
+MIN_SEEN_FRACTION = 0.4  # of the sphere, inside a scan; outside of it less is seen
 
 
 class View(NamedTuple):
     """A view of the cloud, on an equirectangular grid."""
 
-    depth: Array32  # (H, W) range of what is nearest [m], inf where there is nothing
-    rgb: NDArray[Any]  # (H, W, 3) mean colour of what is near that range, 0 where there is nothing
+    depth: Array32  # (H, W) range of the nearest point [m], inf without one
+    rgb: NDArray[Any]  # (H, W, 3) mean colour of the points near that range, 0 without one
 
     @property
     def is_seen(self) -> Mask:
-        """True where something was seen, (H, W)."""
+        """Mask (H, W) of the cells in which a point is seen."""
         return np.isfinite(self.depth)
 
 
@@ -47,7 +47,7 @@ def cells_and_ranges(
 ) -> int:
     """Write cell (row * width + column) and range [m] of a chunk of points; return its length.
 
-    The chunk begins at `begin`. The arithmetic is vectorised, the scatter that follows can't be.
+    The chunk begins at `begin`. This loop is vectorised; what callers do with the cells can't be.
     """
     W = np.float32(width)
     last_column = np.int32(width - 1)
@@ -89,7 +89,7 @@ def mean_colors(
     depth: Array32,
     sums: Array,
 ) -> None:
-    """Add up (H * W, 4): R, G, B [8-bit levels] and count of the points within CELL_BAND of the nearest."""
+    """Add R, G, B [8-bit levels] and count of the points within CELL_BAND of `depth` to `sums` (H * W, 4)."""
     pose = pose_float32(R_cam_from_world, center_world)
     cells = np.empty(DEPTH_CHUNK, np.int32)
     ranges = np.empty(DEPTH_CHUNK, np.float32)
@@ -113,7 +113,7 @@ def select_visible(
     depth: Array32,
     indices: Int64s,
 ) -> int:
-    """Write the indices of the points that are visible, given `depth` (H * W,) [m]; return their number."""
+    """Write the indices of the visible points, by least ranges (H * W,) [m]; return their number."""
     pose = pose_float32(R_cam_from_world, center_world)
     cells = np.empty(DEPTH_CHUNK, np.int32)
     ranges = np.empty(DEPTH_CHUNK, np.float32)
@@ -144,16 +144,16 @@ def render_view(points: PackedPoints, pose: Pose, width: int) -> View:
     """
     depth = nearest_depth(points, pose, width)
     sums = np.zeros((depth.size, 4))
-    R, t = pose.R_cam_from_world, pose.center_world
-    mean_colors(_xyz(points), points.rgbx, R, t, width, depth.reshape(-1), sums)
+    R, center = pose.R_cam_from_world, pose.center_world
+    mean_colors(_xyz(points), points.rgbx, R, center, width, depth.reshape(-1), sums)
     rgb = (sums[:, :3] / np.maximum(sums[:, 3:], 1.0) / 255.0).astype(np.float32)
     return View(depth, rgb.reshape(width // 2, width, 3))
 
 
 def indices_in_front(points: PackedPoints, center_world: Array, depth: Array32) -> Int64s:
-    """Return the indices of the points that are not behind `depth` (H, W) [m], seen from a place (3,) [m].
+    """Return the indices of the points not behind ranges `depth` (H, W) [m], seen from a centre (3,) [m].
 
-    The camera's axes are the world's. A point may be farther by VISIBLE_FACTOR and VISIBLE_OFFSET.
+    `depth` has the world's axes. A point may be farther by VISIBLE_FACTOR and VISIBLE_OFFSET.
     """
     indices = np.empty(len(points), np.int64)
     count = select_visible(_xyz(points), np.eye(3), center_world, depth.shape[1], depth.reshape(-1), indices)
@@ -161,7 +161,7 @@ def indices_in_front(points: PackedPoints, center_world: Array, depth: Array32) 
 
 
 def visible_points(points: PackedPoints, center_world: Array) -> PackedPoints:
-    """Return the points that are visible from `center_world` (3,) [m], whichever way the camera is turned."""
+    """Return the points that are visible from `center_world` (3,) [m], in all directions."""
     depth = nearest_depth(points, Pose(np.eye(3), center_world), VISIBLE_WIDTH)
     return points.take(indices_in_front(points, center_world, depth))
 
