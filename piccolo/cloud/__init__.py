@@ -1,1 +1,1 @@
-"""Point clouds: a reader for each format, then checks and an order common to all."""
+"""Point clouds: a reader for each format, then the same checks and the same order of points for all."""

@@ -10,13 +10,13 @@ from ..geometry.pose import rotation_to_z
 from ..system.arrays import Array
 from ..system.errors import InputError, import_optional
 
-# of points: what photos are compared with
+# what points have beside x y z, with which photos are compared
 Channel = Literal["colors", "intensity", "shape"]
 UpAxis = Literal["auto", "z", "y", "x", "-z", "-y", "-x"]
 
-RANGES = (1.0, 255.0, 65535.0)  # values of full brightness
+RANGES = (1.0, 255.0, 65535.0)  # values that full brightness may have
 WITHOUT_COLORS: tuple[Channel, ...] = ("intensity", "shape")
-COLUMNS = {"i": "intensity", "r": "red", "g": "green", "b": "blue"}  # short names of a line's numbers
+COLUMNS = {"i": "intensity", "r": "red", "g": "green", "b": "blue"}  # short names of columns
 METRES = {"mm": 0.001, "cm": 0.01, "m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}  # per unit of length
 
 
@@ -24,16 +24,16 @@ METRES = {"mm": 0.001, "cm": 0.01, "m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}
 class CloudSettings:
     """Unit, axes, channels and coordinate system of a cloud's files."""
 
-    scale: float | None = None  # metres per unit of the files; None: by the file, else 1
-    up: UpAxis = "auto"  # the axis that points up; auto: the one of the file, z or in glTF y
-    channels: tuple[Channel, ...] = get_args(Channel)  # the first one that the files have is taken
-    crs: str | None = None  # coordinate system, such as EPSG:25832; None: what the file names
-    color_range: float | None = None  # the value of full brightness; None: by the file
-    columns: tuple[str, ...] = ()  # names of the numbers of a line, such as x y z i r g b; none: by the file
+    scale: float | None = None  # metres per unit of the files; None: as the files say, or 1
+    up: UpAxis = "auto"  # the axis that points up; auto: that of the format, y in glTF and else z
+    channels: tuple[Channel, ...] = get_args(Channel)  # the first of these that the files have is read
+    crs: str | None = None  # coordinate system, such as EPSG:25832; None: the one that the file names
+    color_range: float | None = None  # value of full brightness; None: by the file's values
+    columns: tuple[str, ...] = ()  # names of the columns, such as x y z i r g b; empty: by the file
 
     @classmethod
     def of_options(cls, ignore_colors: bool, **others: Any) -> "CloudSettings":
-        """Return the settings that options of users ask for."""
+        """Return the settings for a user's options."""
         channels = WITHOUT_COLORS if ignore_colors else BY_FILE.channels
         return cls(channels=channels, **others)
 
@@ -52,7 +52,10 @@ class CloudSettings:
 
 
 def check_crs(crs: str, what: str = "GPS in photos") -> Any:
-    """Return pyproj's system of x and y that a text names; InputError if there is none."""
+    """Return the coordinate system of x and y that a text names, as pyproj's object.
+
+    Raise InputError if there is none; `what` names the feature that needs pyproj, should it be missing.
+    """
     pyproj = import_optional(what, "pyproj", "gps")
     try:
         return pyproj.CRS.from_user_input(crs).to_2d()
@@ -62,7 +65,7 @@ def check_crs(crs: str, what: str = "GPS in photos") -> Any:
 
 
 def from_wgs84(crs: str, latitude_deg: float, longitude_deg: float) -> tuple[float, float] | None:
-    """Return x and y [m] of a place in a projected system, whatever its unit; None if there are none."""
+    """Return x and y [m] of a place in a projected system, whatever its unit; None if it has no such x, y."""
     system = check_crs(crs)
     pyproj = import_optional("GPS in photos", "pyproj", "gps")
     if not system.is_projected:
@@ -73,12 +76,12 @@ def from_wgs84(crs: str, latitude_deg: float, longitude_deg: float) -> tuple[flo
     return (x * metres, y * metres) if math.isfinite(x) and math.isfinite(y) else None
 
 
-BY_FILE = CloudSettings()  # all follows from the files
-IN_COLORS = CloudSettings(channels=("colors",))  # of files that must have colours
+BY_FILE = CloudSettings()  # all is as the files say
+IN_COLORS = CloudSettings(channels=("colors",))  # the files must have colours
 
 
 def R_z_from_axis(up: UpAxis, of_file: UpAxis) -> Array:
-    """Return the rotation (3, 3) that turns the axis `up` to z; for auto the axis `of_file`."""
+    """Return the rotation (3, 3) that turns the axis `up`, or if that is "auto" the axis `of_file`, to z."""
     name = of_file if up == "auto" else up
     sign = -1.0 if name.startswith("-") else 1.0
     return np.round(rotation_to_z(sign * np.eye(3)["xyz".index(name[-1])])) + 0.0

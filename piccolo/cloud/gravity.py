@@ -1,8 +1,8 @@
-"""The vertical and the walls of a scan by its planes, and which end of the vertical is up by evidence.
+"""The vertical of a scan and the direction of its walls, by its planes; and which end of the vertical is up.
 
-Planes are found by RANSAC. The evidence is what people do over floors and not below ceilings: seats, tables
-and shelves are above floors as high as people reach, and people walk from room to room over floors, while
-lintels, beams and walls divide the space below ceilings. Each cue is the logarithm of a ratio.
+Planes are found by RANSAC. Two cues tell a floor from a ceiling. Seats, tables and shelves stand on floors,
+as high as people reach; little hangs so far below ceilings. And people walk from room to room over floors,
+while lintels, beams and walls divide the space below ceilings. Each cue is the logarithm of a ratio.
 """
 
 from typing import NamedTuple
@@ -13,31 +13,31 @@ from ..system.arrays import Array, Array32, Int64s, Mask
 from .octree import Octree
 
 # Chosen by hand; the noise of scanners (2 to 5 mm) is far below the spacing of the points
-POINT_SPACING = 0.08  # of the points that are used [m]
-MAX_NORMALS = 40_000  # that get a normal: a plane of 1 % of the cloud still has 400
-NUM_PLANE_NEIGHBORS = 24  # with the point itself: at 8 cm a disc of radius 0.22 m
-MIN_FRACTION = 0.01  # of all points, of a dominant plane
+POINT_SPACING = 0.08  # [m] between the points that are used
+MAX_NORMALS = 40_000  # points that get a normal: a plane of 1 % of the cloud still has 400
+NUM_PLANE_NEIGHBORS = 24  # including the point itself: at a spacing of 8 cm a disc of radius 0.22 m
+MIN_FRACTION = 0.01  # a dominant plane has at least this fraction of all points
 NUM_HYPOTHESES = 200  # for each plane: one lies on a plane of 2 % of the points in 98 % of draws
-PLANE_TOLERANCE = 0.03  # of an inlier, from the plane: six times a scanner's noise of 5 mm [m]
-INLIER_ANGLE = np.radians(15.0)  # of its normal, loose since normals near edges lean
-MAX_LEAN = np.radians(15.0)  # of the vertical to a direction that is said to be up
-AGREE_ANGLE = np.radians(3.0)  # of a plane to level or upright, that counts for the vertical
-MIN_ALIGNED = 0.6  # fraction of the planes' area that is level or upright: roofs are neither
-LEVEL_ANGLE = np.radians(8.0)  # of a level surface's normal to the vertical: ramps up to 1 : 7 are floors
-PERSON_HEIGHT = 1.9  # of a person [m]
-FURNITURE = 0.3, 1.2  # heights of seats, tables, counters, shelves above the floor [m]
-WALKABLE_STEP = 0.3  # what is lower does not keep anybody from walking [m]
-WALKING_CELL = 0.25  # of the grid in which people walk [m], or larger in wide scans
+PLANE_TOLERANCE = 0.03  # [m] from a plane to its inliers: six times a scanner's noise of 5 mm
+INLIER_ANGLE = np.radians(15.0)  # between their normals and the plane's; large, as normals near edges lean
+MAX_LEAN = np.radians(15.0)  # between the vertical and a given direction of up, at most
+AGREE_ANGLE = np.radians(3.0)  # a plane this near to level or upright is used to refine the vertical
+MIN_ALIGNED = 0.6  # least fraction of the planes' area that is level or upright: roofs are neither
+LEVEL_ANGLE = np.radians(8.0)  # between a level surface's normal and the vertical: ramps to 1 : 7 count
+PERSON_HEIGHT = 1.9  # [m]
+FURNITURE = 0.3, 1.2  # [m] heights of seats, tables, counters, shelves above the floor
+WALKABLE_STEP = 0.3  # [m] people walk over lower things
+WALKING_CELL = 0.25  # [m] of the grid in which free floor is found; larger in wide scans
 FLOOR_REACH = 2  # cells between the points of a floor, or between free space and the next thing over a floor
-ADDED_CELLS = 20.0  # added to both counts of a ratio, so that a handful says little
+ADDED_CELLS = 20.0  # added to both counts of a ratio, so that a handful of cells decides little
 
 
 class PointNormals(NamedTuple):
-    """A sample of a cloud with the normals there."""
+    """A sample of a cloud's points with their normals."""
 
     points: Array  # (M, 3) [m]
     normals: Array  # (M, 3) unit, of either sign
-    is_flat: Mask  # (M,) the neighbourhood is a plane
+    is_flat: Mask  # (M,) the points around lie in a plane
 
 
 class DominantPlanes(NamedTuple):
@@ -49,13 +49,13 @@ class DominantPlanes(NamedTuple):
 
 
 def dot_products(vectors: Array, axis: Array) -> Array:
-    """Return dot products (M,) of vectors (M, 3) and an axis (3,); by BLAS they would depend on threads."""
+    """Return dot products (M,) of vectors (M, 3) and an axis (3,); those of BLAS depend on threads."""
     return np.asarray(np.einsum("ni,i->n", vectors, axis))
 
 
 def estimate_normals(points: Array32) -> PointNormals:
     """Return normals of an evenly strided sample of a cloud (N, 3) [m], by PCA of the nearest points."""
-    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who asks for up waits for it
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # imported only when up is estimated
 
     sample = points[:: -(-len(points) // MAX_NORMALS)].astype(np.float64)
     nearest = list(range(1, min(NUM_PLANE_NEIGHBORS, len(points)) + 1))
@@ -63,7 +63,7 @@ def estimate_normals(points: Array32) -> PointNormals:
     neighbors -= neighbors.mean(axis=1, keepdims=True)
     variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", neighbors, neighbors))
     across, narrow, wide = variances.T
-    is_flat = (across < 0.05 * narrow) & (narrow > 0.1 * wide)  # thin, and no line
+    is_flat = (across < 0.05 * narrow) & (narrow > 0.1 * wide)  # thin, and not a line
     return PointNormals(sample, axes[:, :, 0], is_flat)
 
 
@@ -96,7 +96,10 @@ def ransac_planes(cloud: PointNormals) -> DominantPlanes:
 
 
 def _are_inliers(cloud: PointNormals, some: Int64s, normals: Array, points: Array) -> Mask:
-    """Return which of some points (S,) lie on planes (H, S) by normals and points (H, 3)."""
+    """Return the mask (H, S) of the points `some` (S,) that lie on each of H planes.
+
+    A plane is given by its normal (H, 3) and a point on it (H, 3) [m].
+    """
     offsets = np.einsum("hi,hi->h", normals, points)[:, None]
     distances = np.einsum("hi,ji->hj", normals, cloud.points[some]) - offsets
     cosines = np.einsum("hi,ji->hj", normals, cloud.normals[some])
@@ -104,9 +107,10 @@ def _are_inliers(cloud: PointNormals, some: Int64s, normals: Array, points: Arra
 
 
 def find_up(octree: Octree) -> tuple[Array, float, str, DominantPlanes]:
-    """Return a scan's vertical (3,), the sign of up along it or 0 if that is not plain, why, and the planes.
+    """Return a scan's vertical (3,), the sign of up along it, a reason, and the planes.
 
-    The vertical is square to the largest area, and along it the scan is lower than it is wide.
+    The vertical is the normal of the largest area of parallel planes; along it the scan must be lower than it
+    is wide. The sign is 1 or -1, or 0 if up is not clear; the reason is a text.
     """
     cloud = estimate_normals(octree.level(POINT_SPACING)[:, :3])
     planes = ransac_planes(cloud)
@@ -126,19 +130,25 @@ def find_up(octree: Octree) -> tuple[Array, float, str, DominantPlanes]:
     return axis, *find_sense(cloud, find_levels(planes, axis), axis, heights, places), planes
 
 
-def level(planes: DominantPlanes, said: Array) -> Array:
-    """Return the vertical (3,) near a direction that is said to be up; that itself if none is, or it fits."""
-    is_near = np.abs(dot_products(planes.normals, said)) > np.cos(MAX_LEAN)
+def level(planes: DominantPlanes, given_up: Array) -> Array:
+    """Return the vertical (3,) by the planes near a given direction of up (3,), pointing up.
+
+    Return the given direction itself if the planes have no vertical near it, or differ by less than 0.2 deg.
+    """
+    is_near = np.abs(dot_products(planes.normals, given_up)) > np.cos(MAX_LEAN)
     is_vertical = is_near & (_areas_by(planes)[1] > MIN_ALIGNED)
     if not is_vertical.any():
-        return said
+        return given_up
     axis = _refine(planes, planes.normals[is_vertical.argmax()])
-    cosine = float(axis @ said)
-    return said if abs(cosine) > np.cos(np.radians(0.2)) else axis * np.sign(cosine)
+    cosine = float(axis @ given_up)
+    return given_up if abs(cosine) > np.cos(np.radians(0.2)) else axis * np.sign(cosine)
 
 
 def _areas_by(planes: DominantPlanes) -> tuple[Array, Array]:
-    """Return what fraction of the planes' area is level, and level or upright, by the normal of each (P,)."""
+    """Return two fractions (P,) of the planes' area, supposing that the normal of each plane is vertical.
+
+    They are the fraction that would be level, and the fraction that would be level or upright.
+    """
     cosines = np.abs(planes.normals @ planes.normals.T)
     areas = planes.areas / planes.areas.sum()
     is_level = cosines > np.cos(LEVEL_ANGLE)
@@ -146,7 +156,7 @@ def _areas_by(planes: DominantPlanes) -> tuple[Array, Array]:
 
 
 def _refine(planes: DominantPlanes, axis: Array) -> Array:
-    """Return the vertical (3,) by least squares on the planes that are nearly level or upright."""
+    """Return the vertical (3,) near an axis, by least squares on planes nearly level or upright."""
     cosines = np.abs(dot_products(planes.normals, axis))
     signs = 1.0 * (cosines < np.sin(AGREE_ANGLE)) - (cosines > np.cos(AGREE_ANGLE))
     spread = np.einsum("n,ni,nj->ij", signs * planes.areas, planes.normals, planes.normals)
@@ -154,27 +164,28 @@ def _refine(planes: DominantPlanes, axis: Array) -> Array:
 
 
 def wall_yaw(planes: DominantPlanes, R_level_from_scan: Array) -> float | None:
-    """Return the smallest turn about z [rad], in (-45, 45] deg, that puts dominant walls along x and y."""
+    """Return the turn about z [rad], in (-45, 45] deg, that aligns walls with x and y; None without."""
     x, y, z = R_level_from_scan @ planes.normals.T
     is_wall = np.abs(z) < np.sin(LEVEL_ANGLE)
     if not is_wall.any():
         return None
-    k = (is_wall * _areas_by(planes)[1]).argmax()  # a wall to which most others are parallel or square
+    k = (is_wall * _areas_by(planes)[1]).argmax()  # the wall to which most area is parallel or square
     turns = -np.arctan2(y[k], x[k]) / (0.5 * np.pi)
     return float(turns - np.ceil(turns - 0.5)) * 0.5 * np.pi
 
 
 def find_yaw_of_walls(octree: Octree) -> float | None:
-    """Return `wall_yaw` of the octree of a cloud whose z is up."""
+    """Return the turn of `wall_yaw` for the octree of a cloud whose z is up."""
     return wall_yaw(ransac_planes(estimate_normals(octree.level(POINT_SPACING)[:, :3])), np.eye(3))
 
 
 def find_sense(
     cloud: PointNormals, levels: Array, axis: Array, heights: Array, places: Array
 ) -> tuple[float, str]:
-    """Return 1 if up is along a vertical (3,), -1 if against it, 0 if that is not plain; and why.
+    """Return 1 if up is along a vertical (3,), -1 if against it, 0 if that is not clear; and the reason.
 
-    By levels (L,) of floors and ceilings, the points' heights (M,) and places (M, 2) in the plan.
+    `levels` (L,) [m] are the heights of floors and ceilings along the vertical; `heights` (M,) [m] and
+    `places` (M, 2) [m] are the points' heights and their positions in the plan.
     """
     if len(levels) < 2:
         return 0.0, "a floor and a ceiling are not both among the dominant planes"
@@ -182,7 +193,7 @@ def find_sense(
     passages = passage_cue(heights, is_level, levels, places)
     cues = np.array([furniture_cue(heights, is_level, levels), passages])
     sense = float(np.sign(cues.sum()))
-    # the least lesser cue: in high storeys, whose trusses look like tables, both cues must agree
+    # least value of the smaller cue: in high storeys, whose trusses look like tables, both cues must agree
     least = 0.3 if np.diff(levels).max() > 4.0 else -0.5
     is_plain = sense * cues.sum() > 1.0 and (sense * cues).min() > least
     reason = "furniture {:+.1f}, free space {:+.1f}".format(*sense * cues)
@@ -190,7 +201,10 @@ def find_sense(
 
 
 def find_levels(planes: DominantPlanes, axis: Array) -> Array:
-    """Return the heights (L,) of floors and ceilings along a vertical (3,), ascending, a person apart."""
+    """Return the heights (L,) [m] of floors and ceilings along a vertical (3,), lowest first.
+
+    Levels nearer to each other than a person's height count as one, that of the largest plane.
+    """
     is_level = np.abs(dot_products(planes.normals, axis)) > np.cos(LEVEL_ANGLE)
     levels: list[float] = []
     for height, area in zip(
@@ -203,23 +217,24 @@ def find_levels(planes: DominantPlanes, axis: Array) -> Array:
 
 
 def furniture_cue(heights: Array, is_level: Mask, levels: Array) -> float:
-    """Compare level faces as high as furniture above levels (L,) with those as far below."""
+    """Return a log ratio: level points as high as furniture above levels (L,), to those as far below."""
     next_level = np.searchsorted(levels, heights[is_level])
     above = heights[is_level] - np.append(-np.inf, levels)[next_level]
     below = np.append(levels, np.inf)[next_level] - heights[is_level]
     low, high = FURNITURE
-    few = 0.001 * len(heights)  # as ADDED_CELLS
+    few = 0.001 * len(heights)  # added to both counts, like ADDED_CELLS
     standing = np.count_nonzero((above > low) & (above < np.minimum(high, below)))
     hanging = np.count_nonzero((below > low) & (below < np.minimum(high, above)))
     return float(np.log((standing + few) / (hanging + few)))
 
 
 def passage_cue(heights: Array, is_level: Mask, levels: Array, places: Array) -> float:
-    """Compare how far space that is free for a person is in one piece above levels (L,) and below them.
+    """Return a log ratio: how connected the space free for a person is above levels, to below.
 
-    That is the mean, over the free area of a level, of the fraction that the piece has of the level's.
+    `levels` (L,) [m] are floors and ceilings. A level's free area falls into connected pieces. How connected
+    it is, is the mean over its cells of the fraction of the area that belongs to the cell's piece.
     """
-    from scipy import ndimage  # noqa: PLC0415  # only who asks for up waits for it
+    from scipy import ndimage  # noqa: PLC0415  # imported only when up is estimated
 
     low, high = np.quantile(places, [0.001, 0.999], axis=0)
     cell = max(WALKING_CELL, float(np.sqrt(np.prod(high - low) / 4e6)))
@@ -228,7 +243,7 @@ def passage_cue(heights: Array, is_level: Mask, levels: Array, places: Array) ->
     def grid(mask: Mask) -> Mask:
         return np.asarray(np.histogramdd(places[mask], edges)[0] > 0)
 
-    pieces = np.full((2, 2), ADDED_CELLS)  # above, below: free cells times their piece's fraction; free cells
+    pieces = np.full((2, 2), ADDED_CELLS)  # above, below: the sum of cells' fractions, their count
     for level in levels:
         sheet = np.pad(grid(is_level & (np.abs(heights - level) < 0.12)), FLOOR_REACH)
         sheet = ndimage.binary_closing(sheet, iterations=FLOOR_REACH)[
@@ -238,7 +253,7 @@ def passage_cue(heights: Array, is_level: Mask, levels: Array, places: Array) ->
             is_free = sheet & ~grid((off > WALKABLE_STEP) & (off < PERSON_HEIGHT))
             is_free &= ndimage.binary_dilation(grid(off > WALKABLE_STEP), iterations=FLOOR_REACH)
             areas = np.bincount(ndimage.label(is_free)[0].ravel())[1:]
-            areas = areas[areas > 8]  # cells of one piece
+            areas = areas[areas > 8]  # smaller pieces do not count
             pieces[k] += (areas**2).sum() / max(areas.sum(), 1), areas.sum()
     above, below = pieces[:, 0] / pieces[:, 1]
     return float(np.log(above / below))

@@ -1,4 +1,4 @@
-"""The octree of a cloud: a pyramid of its voxels, in Morton order, and the nodes that a view needs."""
+"""The octree of a cloud: its voxels at several sizes, in Morton order, and the nodes that a view needs."""
 
 import math
 from typing import NamedTuple
@@ -13,28 +13,28 @@ from ..system.kernels.jit import F0, Scalar, inline_kernel, kernel
 from .voxels import LEAF_SIZE, NUM_LEVELS, THIN, VOXELS_AT_ONCE, Voxels
 
 NODE_BYTES = 6 * 4 + 4  # mean, first child
-LEVEL_BYTES = 8 + 1 + 8 + 4 + 8  # codes, which begin a parent, first children, twice, codes of these
-MAX_NODES = 1 << 22  # that a view collects; reserved, but used only as far as a dense cloud fills it
-RANGES_BELOW = 1 / 20  # a voxel's width divided by its distance: larger ones are rarely drawn at one level
-DIAGONAL = 1.75  # of a voxel, and a little more for rounding: all in it is so near to its mean
+LEVEL_BYTES = 8 + 1 + 8 + 4 + 8  # codes, flags of first children, their indices twice, their codes
+MAX_NODES = 1 << 22  # nodes of a view, at most; memory is reserved, but used only as far as it is filled
+RANGES_BELOW = 1 / 20  # [voxel per range] coarser views are rarely drawn at one level below a node
+DIAGONAL = 1.75  # of a voxel of width 1, with room for rounding: all in it is nearer to its mean
 
 
 class Octree(NamedTuple):
     """Nodes of all levels, coarsest first, in Morton order within a level; kernels take it as an argument."""
 
     nodes: Array32  # (nodes, 6) mean x, y, z [m], r, g, b in [0, 1]
-    first_child: Int32s  # (nodes + 1,) children of i are first_child[i]:first_child[i + 1]
-    level_start: Int32s  # (levels + 1,)
-    leaf_size: float  # [m]
+    first_child: Int32s  # (nodes + 1,) the children of node i are first_child[i]:first_child[i + 1]
+    level_start: Int32s  # (levels + 1,) index of each level's first node
+    leaf_size: float  # [m] width of the finest voxels
 
     def level(self, size: float) -> Array32:
-        """Return the nodes of the level whose voxels are nearest to `size` [m]."""
+        """Return the nodes (N, 6) of the level whose voxels are nearest to `size` [m] in width."""
         finest = len(self.level_start) - 2
         level = finest - int(np.clip(np.rint(np.log2(size / self.leaf_size)), 0, finest))
         return self.nodes[self.level_start[level] : self.level_start[level + 1]]
 
     def without_leaves(self) -> "Octree":
-        """Return the octree whose leaves are the parents of these, for kernels."""
+        """Return the octree without its finest level: the parents of its leaves become the leaves."""
         end = self.level_start[-2]
         first_child = np.minimum(self.first_child[: end + 1], end)
         return Octree(self.nodes[:end], first_child, self.level_start[:-1], 2.0 * self.leaf_size)
@@ -43,10 +43,10 @@ class Octree(NamedTuple):
 def build_octree(voxels: Voxels) -> Octree:
     """Return the octree whose leaves are the voxels."""
     codes = voxels.codes
-    firsts: list[Int32s] = []  # of each level but the finest: its nodes' first children there
+    firsts: list[Int32s] = []  # for each level but the finest, its nodes' first children
     for _ in range(NUM_LEVELS - 1):
         check_memory(len(codes) * LEVEL_BYTES, f"the scan: a level of {len(codes)} voxels", THIN)
-        codes = codes >> 3  # children of a parent follow each other
+        codes = codes >> 3  # the children of a parent are consecutive
         is_first = np.ones(len(codes), dtype=np.bool_)
         np.not_equal(codes[1:], codes[:-1], out=is_first[1:])
         first = np.flatnonzero(is_first)
@@ -66,7 +66,7 @@ def build_octree(voxels: Voxels) -> Octree:
 
 
 def average_children(children: Array32, first: Int32s, parents: Array32) -> None:
-    """Write the means (M, 6) of the children (N, 6) that begin at `first` (M,)."""
+    """Write the means `parents` (M, 6) of the children (N, 6) that begin at the rows `first` (M,)."""
     for begin in range(0, len(first), VOXELS_AT_ONCE):
         part = slice(begin, begin + VOXELS_AT_ONCE)
         last = first[begin + VOXELS_AT_ONCE] if begin + VOXELS_AT_ONCE < len(first) else len(children)
@@ -78,9 +78,10 @@ def average_children(children: Array32, first: Int32s, parents: Array32) -> None
 
 
 def recolor(octree: Octree, colors: Array32, weights: Array32) -> Octree:
-    """Return the octree with leaves of other colours (leaves, 3), in [0, 1], and weights (leaves,).
+    """Return the octree with other colours of its leaves (leaves, 3), in [0, 1].
 
-    A leaf of weight 0 gets its colour from those around it, the nearer level first.
+    Each colour has a weight (leaves,). A leaf of weight 0 gets the weighted mean colour of the smallest voxel
+    around it that has a weight.
     """
     start = octree.level_start
     nodes = octree.nodes.copy()
@@ -104,9 +105,9 @@ def recolor(octree: Octree, colors: Array32, weights: Array32) -> Octree:
 
 @inline_kernel
 def uniform_level(least_distance: Array32, level: int, low: Scalar, high: Scalar) -> int:
-    """Return the one level at which all below a node is drawn; 0 if there is none.
+    """Return the level at which all voxels below a node are drawn; 0 if they are not all drawn at one level.
 
-    All of it is at distances from `low` to `high`; `level` is that of the node's children.
+    All of them are at distances [m] from `low` to `high`; `level` is that of the node's children.
     """
     k = level + 1
     while least_distance[k] > low and least_distance[k] > F0:
@@ -124,7 +125,7 @@ def take_all(
     directions: Array32,
     count: int,
 ) -> None:
-    """Write the nodes from first to last, and their positions relative to the centre, from `count` on."""
+    """Write nodes from `first` to `last` and their positions [m] from the centre, from `count` on."""
     x, y, z = directions[0], directions[1], directions[2]
     for i in range(last - first):
         node = np.uintp(first + i)
@@ -148,9 +149,9 @@ def take_far(
     stack: Int32s,
     top: int,
 ) -> tuple[int, int]:
-    """Write the nodes at a squared distance of at least `least` [m^2], like `take_all`; return both counts.
+    """Write the nodes at a squared distance of at least `least` [m^2], as `take_all` does.
 
-    The other nodes go on the stack, from `top` on.
+    The other nodes go on the stack, from `top` on. Return the new `count` and the new `top`.
     """
     x, y, z = directions[0], directions[1], directions[2]
     for node in range(first, last):
@@ -173,12 +174,12 @@ def take_far(
 def collect(
     tree: Octree, center: Array, voxel_per_range: float, cone: Cone, found: Int32s, directions: Array32
 ) -> int:
-    """Write the nodes that, seen from `center`, are small enough, or leaves; return their number.
+    """Write the largest nodes that are small enough, seen from a centre, or leaves; return their number.
 
-    Most of those outside of a cone are left out; the order of the others stays. Small enough are voxels of
-    at most `voxel_per_range` times their distance. `directions` (3, N) get the positions relative to the
-    centre [m]. If all below a node is drawn at one level, its nodes there are consecutive: most nodes are
-    found in this way, without a test of each.
+    A voxel is small enough if it is at most `voxel_per_range` times its distance wide. `found` (N,) gets the
+    nodes, `directions` (3, N) their positions from the centre [m]. Most nodes outside of the cone, in the
+    octree's frame, are left out; the order of the others is the same as without a cone. If all voxels below
+    a node are drawn at one level, they are consecutive there: most are found so, without a test of each.
     """
     nodes = tree.nodes
     first_child = tree.first_child
@@ -233,7 +234,7 @@ def collect(
 
 @inline_kernel
 def find_level(tree: Octree, node: int) -> int:
-    """Return the level of a node, 0 for the coarsest voxels."""
+    """Return the level of a node; 0 is that of the coarsest voxels."""
     level = 0
     while node >= tree.level_start[level + 1]:
         level += 1

@@ -1,4 +1,4 @@
-"""The checks of a file's points, chunk by chunk, which also turns them into metres."""
+"""The checks of a file's points, chunk by chunk, and their conversion to metres."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,38 +10,38 @@ from ..system.arrays import Array, Bytes, Mask
 from ..system.errors import InputError
 from .readers import reader
 
-MIN_POINTS = 1000
-MIN_BRIGHTEST = 2  # of 255; 16-bit fields that hold 8-bit values come out at 1
-COARSE_STEP = 0.01  # [m] steps between float32 numbers that are reported, from 131 km on
+MIN_POINTS = 1000  # of a file
+MIN_BRIGHTEST = 2  # of 255, of the brightest colour: 8-bit values in 16-bit fields are read as 1 at most
+COARSE_STEP = 0.01  # [m] larger steps between float32 numbers are warned of: from 131 km on
 Chunk = tuple[Array, Bytes]  # finite points (N, 3) [m], colours (N, 3)
 
 
 def find_box(points: Array) -> Array:
-    """Return the least and the greatest coordinates (2, 3) of points (N, 3); NaN where one is NaN."""
-    columns = points.T  # faster one by one
+    """Return the least and the greatest coordinates (2, 3) of points (N, 3); NaN where any is NaN."""
+    columns = points.T  # column by column, which is faster
     return np.array([[a.min(initial=np.inf) for a in columns], [a.max(initial=-np.inf) for a in columns]])
 
 
 @dataclass
 class PointValidator:
-    """Checks of a file's points, and their counts so far."""
+    """The checks of a file's points, and what has been counted so far."""
 
     path: Path
-    units: Array  # (3,) of the file's x, y, z [m]
-    is_colored: bool = True
+    units: Array  # (3,) [m] units of the file's x, y, z
+    is_colored: bool = True  # the file has colours
     num_finite: int = 0
-    num_dropped: int = 0  # with NaN or infinite coordinates
-    brightest: int = 0
-    color: Bytes | None = None  # (3,) of the first point
-    is_varied: bool = False  # another point has another colour
-    step: float = 0.0  # [m] between numbers at the farthest point that is stored in float32
+    num_dropped: int = 0  # points with NaN or infinite coordinates
+    brightest: int = 0  # largest value of any colour
+    color: Bytes | None = None  # (3,) colour of the first point
+    is_varied: bool = False  # not all points have this colour
+    step: float = 0.0  # [m] largest step between neighbouring float32 numbers, at the farthest point
     # (2, 3) least and greatest coordinates so far [m]
     box: Array = field(default_factory=lambda: find_box(np.empty((0, 3))))
 
     def filter(self, raw: reader.RawCloud) -> Chunk:
         """Count the points of a chunk; return the finite ones in metres."""
         colors = raw.colors
-        with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
+        with np.errstate(invalid="ignore"):  # a signalling NaN
             points: Array = raw.points_world.astype(np.float64, copy=False)
         box = find_box(points)
         if not np.isfinite(box).all():
@@ -70,7 +70,7 @@ class PointValidator:
         return points, colors
 
     def check(self) -> None:
-        """Refuse a file without enough points or colours, after its last chunk."""
+        """After the last chunk, refuse a file that has too few finite points, or only black ones."""
         if self.num_finite < MIN_POINTS:
             found = f"found {self.num_finite} finite points ({self.num_dropped} with NaN or infinity)"
             raise InputError(f"{self.path}: {found}, wanted at least {MIN_POINTS}")
@@ -79,14 +79,14 @@ class PointValidator:
             raise InputError(f"{self.path}: {found}, wanted their colours; `color_range` sets their range")
 
     def warnings(self) -> tuple[str, ...]:
-        """Return warnings if points were left out, or are stored with too few digits."""
-        found = []
+        """Return warnings: points left out, all of one colour, or stored with too few digits."""
+        texts = []
         if self.num_dropped:
-            found.append(f"{self.num_dropped} points with NaN or infinite coordinates left out")
+            texts.append(f"{self.num_dropped} points with NaN or infinite coordinates left out")
         if self.is_colored and not self.is_varied and self.color is not None:
             color = " ".join(map(str, self.color.tolist()))
-            found.append(f"all points have one colour ({color}), which shows nothing: wanted their colours")
+            texts.append(f"all points have one colour ({color}), which shows nothing: wanted their colours")
         if self.step >= COARSE_STEP:
             what = f"its float32 coordinates, far from the origin, are rounded to {self.step:.2g} m"
-            found.append(f"{what}: export it in float64, or nearer to its origin")
-        return tuple(f"{self.path}: {text}" for text in found)
+            texts.append(f"{what}: export it in float64, or nearer to its origin")
+        return tuple(f"{self.path}: {text}" for text in texts)

@@ -12,24 +12,24 @@ from ..system.kernels.jit import Scalar, inline_kernel, kernel
 from .octree import DIAGONAL, Octree
 
 BIN = 0.005  # [m] of heights
-NUM_PROFILE_BINS = 19  # above a patch, and as many below
-PROFILE_REACH = (NUM_PROFILE_BINS + 0.5) * BIN  # [m]
-MOST_AROUND = 8192  # voxels around a place: thirty layers of 2 cm
-NORMAL_TOLERANCE = 0.0125  # [m] to the sheet by which a normal is found
-NUM_FITS = 2
-NUM_SQUARED = 6  # times, even, so that the greatest of three eigenvalues rules
-MIDDLE_BINS = 8  # BIN [m] to the sheet from the voxel that chose the patch
-TINY_NORM = 1e-150
-FEW_VOXELS = 10  # voxels in a sheet do not tell its normal
-PATCHES_AT_ONCE = 250  # patches of a task
+NUM_PROFILE_BINS = 19  # bins above a patch, and as many below
+PROFILE_REACH = (NUM_PROFILE_BINS + 0.5) * BIN  # [m] height of a profile above and below its patch
+MOST_AROUND = 8192  # voxels around a place, at most: thirty layers of 2 cm
+NORMAL_TOLERANCE = 0.0125  # [m] from a sheet to the voxels by which its normal is found
+NUM_FITS = 2  # of sheet and normal in turn
+NUM_SQUARED = 6  # times (even) that a matrix is squared: only its greatest eigenvalue is left
+MIDDLE_BINS = 8  # [bins] from the voxel at which a patch is placed within which its sheet is searched
+TINY_NORM = 1e-150  # smaller norms count as this
+FEW_VOXELS = 10  # a sheet with fewer voxels has no normal
+PATCHES_AT_ONCE = 250  # patches that one task measures
 
 
 class Profiles(NamedTuple):
-    """Patches of a scan, and what lies over and under them."""
+    """N patches of a scan, and the voxels above and below each."""
 
-    places: Array  # (N, 3) [m]
+    places: Array  # (N, 3) [m] their middles
     normals: Array  # (N, 3) unit, of either sign
-    counts: Int32s  # (N, 4, 2 NUM_PROFILE_BINS + 1) voxels by quarter of the patch and by height, upwards
+    counts: Int32s  # (N, 4, 2 NUM_PROFILE_BINS + 1) voxels by quarter of the patch and height
 
 
 @inline_kernel
@@ -90,7 +90,10 @@ def write_square(matrix: Array, square: Array) -> None:
 
 @inline_kernel
 def find_normal(moments: Array) -> Triple:
-    """Return the unit axis of the least eigenvalue of a symmetric matrix (3, 3): powers of its adjugate."""
+    """Return the unit eigenvector of the least eigenvalue of a symmetric matrix (3, 3).
+
+    It is a column of a high power of the matrix' adjugate.
+    """
     A = np.empty((3, 3))
     B = np.empty((3, 3))
     write_adjugate(moments, A)
@@ -107,7 +110,10 @@ def find_normal(moments: Array) -> Triple:
 
 @inline_kernel
 def find_sheet(offsets: Array, count: int, normal: Triple, radius: float) -> float:
-    """Return the height [m] near zero, along a normal, at which most offsets (N, 3) in a disc are."""
+    """Return the height [m] near 0, along a normal, at which a disc has most of the offsets (N, 3) [m].
+
+    Only the first `count` offsets are used; `radius` [m] is the disc's.
+    """
     heights = np.zeros(2 * MIDDLE_BINS + 1)
     for i in range(count):
         height = dot(offsets[i], normal)
@@ -128,9 +134,10 @@ def find_sheet(offsets: Array, count: int, normal: Triple, radius: float) -> flo
 def find_moments(
     offsets: Array, count: int, normal: Triple, radius: float, sheet: float, within: float, moments: Array
 ) -> int:
-    """Write the second moments of offsets (N, 3) in a disc, and their mean (row 3); return their number.
+    """Write the second moments of the offsets in a sheet, and their mean as row 3; return their number.
 
-    Their heights along the normal are within a tolerance [m] of a sheet's.
+    The offsets in the sheet are those of the first `count` (N, 3) [m] that are in the disc of `radius` [m]
+    and whose heights along the normal differ from `sheet` [m] by less than `within` [m].
     """
     moments[:] = 0.0
     num = 0
@@ -155,7 +162,10 @@ def find_moments(
 def count_heights(
     offsets: Array, count: int, normal: Triple, sheet: Scalar, radius: float, counts: Int32s
 ) -> None:
-    """Count offsets (N, 3) in quarters of a disc by heights over a sheet: (4, 2 NUM_PROFILE_BINS + 1)."""
+    """Count the first `count` offsets (N, 3) [m] by quarter of a disc and by height above a sheet.
+
+    `counts` (4, 2 NUM_PROFILE_BINS + 1) is added to.
+    """
     is_upright = math.fabs(normal[2]) < 0.7
     u = (normal[1], -normal[0], 0.0) if is_upright else (0.0, normal[2], -normal[1])
     v = cross(normal, u)
@@ -169,9 +179,10 @@ def count_heights(
 
 @kernel
 def write_profiles(tree: Octree, radius: float, places: Array, normals: Array, counts: Int32s) -> None:
-    """Write the profile of the patch at each place (N, 3), which is moved onto the sheet nearest to it.
+    """Write the normal and the profile of the patch at each place (N, 3) [m].
 
-    `normals` (N, 3) and `counts` (N, 4, B) are written; they stay zero where there are too few voxels.
+    The place is moved onto the patch's main sheet. `normals` (N, 3) and `counts` (N, 4, B) hold zeros before,
+    and keep them where there are too few voxels.
     """
     offsets = np.empty((MOST_AROUND, 3))
     moments = np.empty((4, 3))
@@ -199,7 +210,7 @@ def write_profiles(tree: Octree, radius: float, places: Array, normals: Array, c
 
 
 def measure_profiles(tree: Octree, leaves: Int64s, radius: float, workers: Workers) -> Profiles:
-    """Return the profiles of patches of a radius [m] around leaves (N,), without those that are no plane."""
+    """Return the profiles of patches with a radius [m] around leaves (N,), without those on no plane."""
     places = tree.nodes[leaves, :3].astype(np.float64)
     normals = np.zeros((len(leaves), 3))
     counts = np.zeros((len(leaves), 4, 2 * NUM_PROFILE_BINS + 1), np.int32)
@@ -208,8 +219,7 @@ def measure_profiles(tree: Octree, leaves: Int64s, radius: float, workers: Worke
         some = slice(begin, begin + PATCHES_AT_ONCE)
         write_profiles(tree, radius, places[some], normals[some], counts[some])
 
-    Workers(workers.num_threads).map(
-        write, range(0, len(leaves), PATCHES_AT_ONCE), ""
-    )  # too short to be shown
+    silent = Workers(workers.num_threads)  # without progress: the work is too short to show it
+    silent.map(write, range(0, len(leaves), PATCHES_AT_ONCE), "")
     is_plane = normals.any(axis=1)
     return Profiles(places[is_plane], normals[is_plane], counts[is_plane])

@@ -1,6 +1,6 @@
-"""Clouds in files, read as often as needed and checked chunk by chunk: into voxels, or into memory.
+"""Clouds in files: read chunk by chunk, as often as needed, checked, and put into voxels or into memory.
 
-A file's format follows from its first bytes, or else from its name.
+A file's format is known by its first bytes, or else by its name.
 """
 
 import math
@@ -25,23 +25,23 @@ from .point_validator import Chunk, PointValidator, find_box
 from .readers import e57, e57_file, gltf, las, las_file, mesh, npz, pcd, ply, reader, text
 from .voxels import Voxels, VoxelTable, morton_order
 
-METRES_LIMIT = 2000.0  # [m], a scan wider than this along two axes is more likely in millimetres
-FAR_FROM_ORIGIN = 16_384.0  # [m] from the origin, where float32 steps by 2 mm
-MAX_EXTENT_SAMPLES = 100_000  # points that the estimate of the extent looks at
+METRES_LIMIT = 2000.0  # [m] a scan wider than this along two axes is more likely in millimetres
+FAR_FROM_ORIGIN = 16_384.0  # [m] from the origin, where neighbouring float32 numbers differ by 2 mm
+MAX_EXTENT_SAMPLES = 100_000  # points by which the extent is estimated
 
-ALONE = Workers()
-ARRAYS = Path("arrays")  # the name of a scan that is no file, in messages and results
+ALONE = Workers()  # the calling thread only
+ARRAYS = Path("arrays")  # in messages and results, the name of a scan that is given as arrays
 
 
 def _name(paths: Sequence[Path]) -> str:
-    """Return the name of files together in messages."""
+    """Return the name of some files, taken together, for messages."""
     return f"{paths[0]} and {len(paths) - 1} more" if len(paths) > 1 else str(paths[0])
 
 
 def unit_warnings(label: str, points: Array32) -> tuple[str, ...]:
-    """Return a warning if points (N, 3) look like millimetres, or are too far apart for float32.
+    """Return a warning if points (N, 3) [m] look like millimetres, or are too far apart for float32.
 
-    It looks like millimetres if 98 % of the points span more than 2,000 along at least two axes.
+    They look like millimetres if 98 % of them span more than METRES_LIMIT along at least two axes.
     """
     samples = points[:: 1 + len(points) // MAX_EXTENT_SAMPLES]
     low, high = np.percentile(samples, [1.0, 99.0], axis=0)
@@ -57,17 +57,17 @@ def unit_warnings(label: str, points: Array32) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class CloudPoints:
-    """Coloured points near a local origin, in an order that does not depend on the file's."""
+    """Coloured points relative to a local origin, in an order that does not depend on the file's."""
 
     points: Array32  # (N, 3) world minus origin_world [m], all finite, Morton order
     colors: Bytes  # (N, 3) RGB
     origin_world: Array  # (3,) what was subtracted from the file's coordinates [m]
     warnings: tuple[str, ...] = ()  # one line each, for the user
     up: UpAxis = "z"  # the axis that points up according to the files
-    has_colors: bool = True  # else greys, by the intensity or all alike
+    has_colors: bool = True  # if not, `colors` are greys: intensity, or all equal
 
     def pack(self) -> LocalCloud:
-        """Return the points as kernels read them."""
+        """Return the points in the form that kernels read."""
         return LocalCloud(np.eye(3), self.origin_world, pack_points(self.points, self.colors), self.warnings)
 
 
@@ -75,26 +75,26 @@ class CloudPoints:
 class CloudStream:
     """One cloud in one or several files. Each reading begins at the start and ends with all checks."""
 
-    sources: Sequence[reader.PointSource]  # in an order of their own: the user's changes nothing
+    sources: Sequence[reader.PointSource]  # sorted by path, so that the user's order changes nothing
     show: Progress = no_progress
-    sha256: str = ""  # of what is read, if that is known
-    # (2, 3) least and greatest of all points read so far [m]
+    sha256: str = ""  # of arrays; empty for files
+    # (2, 3) [m] least and greatest coordinates of all points read so far
     box: Array = field(default_factory=lambda: find_box(np.empty((0, 3))))
 
     @property
     def label(self) -> str:
-        """The name of all files together in messages."""
+        """The name of all files, taken together, for messages."""
         return _name([source.path for source in self.sources])
 
     @property
     def scale(self) -> float:
-        """Metres per unit of all files and axes; 1 if they differ: what is written then is in metres."""
+        """Metres per unit of all files and axes; 1 if units differ: the cloud is then written in metres."""
         units = self.units
         return units.pop() if len(units) == 1 else 1.0
 
     @property
     def units(self) -> set[float]:
-        """The different units [m] of files and axes."""
+        """The distinct units [m] of files and axes."""
         return {unit for source in self.sources for unit in source.units}
 
     @property
@@ -110,11 +110,11 @@ class CloudStream:
 
     @property
     def has_colors(self) -> bool:
-        """False if the colours are greys, by the intensity of the points or all alike."""
+        """False if the colours are greys: the points' intensity, or all equal."""
         return all(source.channel == "colors" for source in self.sources)
 
     def chunks(self, validators: list[PointValidator]) -> Iterator[Chunk]:
-        """Yield the finite points in metres; append each file's validator once it is read."""
+        """Yield the finite points in metres; append each file's validator after its last chunk."""
         for source in self.sources:
             validator = PointValidator(
                 source.path, np.array(source.units), source.channel == "colors", box=self.box
@@ -133,7 +133,7 @@ class CloudStream:
             validators.append(validator)
 
     def _warnings(self, validators: list[PointValidator]) -> list[str]:
-        """Return the warnings of all files; what is said of the unit of several is said once."""
+        """Return the warnings of all files; the same note on the units of several files appears once."""
         of_units: dict[str, list[Path]] = {}
         for source in self.sources:
             if source.unit_note:
@@ -143,9 +143,9 @@ class CloudStream:
         return lines + [line for source, found in pairs for line in (*source.warnings, *found.warnings())]
 
     def voxels(self, R_map_from_world: Array, workers: Workers = ALONE) -> Voxels:
-        """Return the points averaged voxel by voxel, in axes turned by a rotation (3, 3).
+        """Return the voxels of the points, in axes turned from the world's by a rotation (3, 3).
 
-        With several threads the next chunk is read while one is added.
+        With several threads, the next chunk is read while one is added.
         """
         validators: list[PointValidator] = []
         table = VoxelTable(self.label)
@@ -166,15 +166,14 @@ class CloudStream:
         """Return all points, in Morton order.
 
         The middle of their bounding box, rounded to whole metres, becomes `origin_world` and is subtracted in
-        float64. This is done for every cloud, so that UTM coordinates and a room at the origin take the same
-        path.
+        float64. This is done for every cloud, whether in UTM coordinates or near the origin.
         """
         validators: list[PointValidator] = []
         chunks = list(self.chunks(validators))
         points_world = np.concatenate([points_world for points_world, _ in chunks])
         colors = np.concatenate([colors for _, colors in chunks])
         chunks.clear()
-        # Rounded to metres, so that adding it back costs no digit; of the box, so that no order matters.
+        # Whole metres can be added back exactly; the box's middle does not depend on the order of the points.
         # + 0.0 turns -0.0 into 0.0: equal points have equal bits.
         origin_world = np.round(0.5 * (points_world.min(axis=0) + points_world.max(axis=0))) + 0.0
         points = (points_world - origin_world + 0.0).astype(np.float32)
@@ -186,33 +185,33 @@ class CloudStream:
 
 
 def stream_of_arrays(points: Floats, colors: Values | None, color_range: float | None = None) -> CloudStream:
-    """Return a cloud in memory: points (N, 3), and colours (N, 3) of any range, or None."""
+    """Return the stream of a cloud in memory: points (N, 3) [m], and colours (N, 3) of any range, or None."""
     if points.ndim != 2 or points.shape[1:] != (3,) or (colors is not None and colors.shape != points.shape):
         shapes = f"{points.shape} and {None if colors is None else colors.shape}"
         raise InputError(f"points, colors: found shapes {shapes}, wanted arrays of shape (N, 3)")
     if points.dtype.kind not in "fiu":
         raise InputError(f"points: found {points.dtype}, wanted numbers")
-    given = np.full(points.shape, reader.GRAY, np.uint8) if colors is None else colors
-    parts = [(reader.points_of([*points.T]), given)]
-    usual = reader.USUAL.get(given.dtype.str[1:], reader.BYTE_RANGE)
-    settings = replace(BY_FILE, color_range=255.0 if given.dtype == np.uint8 else color_range)
+    values = np.full(points.shape, reader.GRAY, np.uint8) if colors is None else colors
+    parts = [(reader.points_of([*points.T]), values)]
+    usual = reader.USUAL.get(values.dtype.str[1:], reader.BYTE_RANGE)
+    settings = replace(BY_FILE, color_range=255.0 if values.dtype == np.uint8 else color_range)
     brightest, notes = reader.find_brightest(ARRAYS, parts, settings, usual)
     chunk = next(reader.color_chunks(parts, brightest, lambda row: f"{ARRAYS}, row {row}"))
     channel: Channel = "shape" if colors is None else "colors"
-    source = reader.PointSource(ARRAYS, lambda: iter([chunk]), len(given), notes, channel=channel)
-    return CloudStream([source], sha256=sha256_of_arrays(points, given))
+    source = reader.PointSource(ARRAYS, lambda: iter([chunk]), len(values), notes, channel=channel)
+    return CloudStream([source], sha256=sha256_of_arrays(points, values))
 
 
 class CloudFormat(NamedTuple):
-    """A format and its reader."""
+    """A format of cloud files and its reader."""
 
     name: str
     suffixes: tuple[str, ...]  # lower case, with the dot
-    has_magic: Callable[[bytes], object]  # true of a file's first HEAD_SIZE bytes; content goes before names
-    # MissingChannelError if the file has no such channel
+    has_magic: Callable[[bytes], object]  # whether a file's first HEAD_SIZE bytes are of the format
+    # opens a file; raises MissingChannelError if it has no such channel
     open_source: Callable[[Path, CloudSettings, Channel], reader.PointSource]
-    has_columns: bool = False  # that can be named
-    read_crs: Callable[[Path], str] | None = None  # the system that a file names, empty for none
+    has_columns: bool = False  # the user may name the columns
+    read_crs: Callable[[Path], str] | None = None  # returns the coordinate system that a file names, or ""
 
 
 def _begins(*magic: bytes) -> Callable[[bytes], bool]:
@@ -251,11 +250,12 @@ WANTED = f"wanted a point cloud: {', '.join(f.name for f in FORMATS)}"
 def open_cloud(
     paths: Sequence[Path], settings: CloudSettings = BY_FILE, show: Progress = no_progress
 ) -> CloudStream:
-    """Return the cloud in one or several files, before its points are read, in the first channel of all.
+    """Return the cloud in one or several files, with the first channel that they have; no point is read yet.
 
-    Raises InputError if a file is missing, has a damaged header, none of the channels, or an unknown format,
-    or if some files have colours and some have none. Reading the points raises it where the data are damaged
-    or fail the checks of `PointValidator`.
+    Raise InputError if a file is missing, has a damaged header, none of the channels or an unknown format, or
+    if some files have colours and some have none. Files without colours of which only some have intensity are
+    read by their shape. Reading the points raises InputError where the data are damaged or fail the checks of
+    `PointValidator`.
     """
     sources = [open_source(path, settings) for path in sorted(paths)]
     if len({source.channel for source in sources}) > 1:
@@ -270,7 +270,7 @@ def open_cloud(
 
 
 def open_source(path: Path, settings: CloudSettings = BY_FILE) -> reader.PointSource:
-    """Return the points of a file in any supported format, in the first of the channels that it has."""
+    """Return the points of a file in any supported format, with the first of the channels that it has."""
     try:
         format_ = _format_of(path)
         if settings.columns and not format_.has_columns:
@@ -288,13 +288,13 @@ def open_source(path: Path, settings: CloudSettings = BY_FILE) -> reader.PointSo
 
 
 def _open_channel(format_: CloudFormat, path: Path, settings: CloudSettings) -> reader.PointSource:
-    """Return the points in the first channel that the file has, with a warning if it has no colours."""
+    """Return the points with the first channel that the file has, and a warning if it has no colours."""
     missing: list[reader.MissingChannelError] = []
     for channel in settings.channels:
         try:
             source = format_.open_source(path, settings, channel)
         except reader.MissingChannelError as error:
-            missing.append(error.with_traceback(None))  # it would keep the file open
+            missing.append(error.with_traceback(None))  # a traceback would keep the file open
             continue
         notes = (str(missing[0]),) if missing and settings.channels[0] == "colors" else ()
         return source._replace(channel=channel, warnings=(*source.warnings, *notes))
@@ -302,7 +302,7 @@ def _open_channel(format_: CloudFormat, path: Path, settings: CloudSettings) -> 
 
 
 def _hint(format_: CloudFormat, path: Path, settings: CloudSettings) -> str:
-    """Return what to add to the refusal of a file that would be read without its colours."""
+    """Return advice for the message that refuses a file, if the file could be read without its colours."""
     if settings.channels != BY_FILE.channels:
         return ""
     try:
@@ -331,9 +331,9 @@ def _format_of(path: Path) -> CloudFormat:
 
 
 def read_crs(paths: Sequence[Path]) -> str:
-    """Return the system that the first of a scan's files names, as WKT or EPSG:code; empty if it names none.
+    """Return the coordinate system that the first of a scan's files names, as WKT or EPSG:code, or "".
 
-    LAS and LAZ: the OGC WKT record, or the GeoTIFF keys. E57: coordinateMetadata.
+    LAS and LAZ files name it in the OGC WKT record or in GeoTIFF keys, E57 files in coordinateMetadata.
     """
     with paths[0].open("rb") as file:
         head = file.read(reader.HEAD_SIZE)

@@ -1,6 +1,7 @@
-"""The units in which a scan's coordinates are, by the coordinate system that its file names.
+"""The units of a scan's coordinates, by the coordinate system that its file names.
 
-That is a text (OGC WKT 1 or 2, also ESRI's) or GeoTIFF keys. x and y have one unit, z may have another.
+A file names it by a text (OGC WKT 1 or 2, also ESRI's) or by GeoTIFF keys. x and y have the same unit, z may
+have another.
 """
 
 import math
@@ -15,18 +16,18 @@ from ..system.errors import InputError, import_optional
 from .cloud_settings import METRES
 
 TOKEN = re.compile(r'"(?:[^"]|"")*"|[\w.+-]+|[\[\](),]')
-WITHIN = ("COMPD_CS", "COMPOUNDCRS", "BOUNDCRS", "SOURCECRS", "COORDINATEMETADATA")  # of other systems
+# keywords of systems that contain others
+WITHIN = ("COMPD_CS", "COMPOUNDCRS", "BOUNDCRS", "SOURCECRS", "COORDINATEMETADATA")
 PROJECTED = ("PROJCS", "PROJCRS", "PROJECTEDCRS", "DERIVEDPROJCRS")
 OTHERS = ("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS", "GEOCCS")  # neither projected nor in degrees
 GEOGRAPHIC = ("GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS")
 VERTICAL = ("VERT_CS", "VERTCS", "VERTCRS", "VERTICALCRS")
 LENGTHS = ("UNIT", "LENGTHUNIT")
-UNIT_ROUNDING = (
-    2e-7  # of a unit that is written with few digits; feet and US survey feet differ by ten times that
-)
+# relative, of a unit that is written with few digits; feet and US survey feet differ by ten times as much
+UNIT_ROUNDING = 2e-7
 UNIT_CODES = {9001: 1.0, 9002: METRES["ft"], 9003: METRES["us-ft"], 9036: 1000.0, 1033: 0.01, 1025: 0.001}
-USER_DEFINED = 32767
-MODEL_KEY = 1024
+USER_DEFINED = 32767  # code of what the file defines itself
+MODEL_KEY = 1024  # keys of GeoTIFF, and values of keys
 GEOGRAPHIC_KEY = 2048
 PROJECTED_KEY = 3072
 LINEAR_UNIT_KEY = 3076
@@ -34,10 +35,10 @@ LINEAR_SIZE_KEY = 3077
 VERTICAL_KEY = 4096
 VERTICAL_UNIT_KEY = 4099
 IN_DEGREES = 2  # the model of a geographic system
-DOUBLES_ID = 34736  # where keys have their numbers that are not whole
+DOUBLES_ID = 34736  # record with the values of keys that are not whole numbers
 NAMES = {1.0: "metres", METRES["ft"]: "feet", METRES["us-ft"]: "US survey feet", 0.01: "cm", 0.001: "mm"}
-LARGEST = 360.0, 90.0  # [deg]
-WIDEST = 1.0  # [deg] of a scan
+LARGEST = 360.0, 90.0  # [deg] of longitude and latitude
+WIDEST = 1.0  # [deg] that a scan may span: a wider one can't be in degrees
 OVERRULED = "`units` overrules it"
 
 Axes = tuple[float, float, float]  # of x, y, z
@@ -45,17 +46,17 @@ PLAIN: Axes = (1.0, 1.0, 1.0)
 
 
 class Units(NamedTuple):
-    """The units that a coordinate system names [m]; None where it names none."""
+    """The units of a coordinate system; None where it names none."""
 
-    across: float | None = None  # of x and y
-    up: float | None = None  # of z
+    across: float | None = None  # [m] of x and y
+    up: float | None = None  # [m] of z
     is_degrees: bool = False  # x and y are angles
-    unknown: str = ""  # the system whose unit is not known
+    unknown: str = ""  # name of the system, if its unit is not known
 
 
 @dataclass
 class Node:
-    """A keyword of WKT with what its brackets hold."""
+    """A keyword of WKT with the texts and nodes in its brackets."""
 
     keyword: str
     texts: list[str] = field(default_factory=list)
@@ -67,7 +68,7 @@ class Node:
 
 
 def parse_wkt(text: str) -> list[Node]:
-    """Return the outermost nodes of a text; what does not belong to WKT is passed over."""
+    """Return the outermost nodes of a text in WKT; anything else in it is ignored."""
     root = Node("")
     open_nodes = [root]
     word = ""
@@ -88,7 +89,7 @@ def parse_wkt(text: str) -> list[Node]:
 
 
 def units_of_wkt(text: str) -> Units:
-    """Return the units of a coordinate system in WKT, also of one that is compound."""
+    """Return the units of a coordinate system in WKT, which may be compound."""
     units = Units()
     nodes = deque(parse_wkt(text))
     while nodes:
@@ -110,34 +111,37 @@ def units_of_wkt(text: str) -> Units:
 
 
 def _lengths(node: Node) -> list[float]:
-    """Return the units [m] of a system's axes, or the one of all; none if it names none."""
+    """Return the units [m] of a system's axes, or one unit for all; an empty list if it names none."""
     of_all = [length for unit in node.all(*LENGTHS) for length in _length(unit)]
     of_axes = [_lengths(axis) for axis in node.all("AXIS")] if node.keyword != "AXIS" else []
     return [lengths[0] for lengths in of_axes if lengths] or of_all[:1]
 
 
 def _length(unit: Node) -> list[float]:
-    """Return the length [m] that a node of a unit names; none if it is no length."""
+    """Return the length [m] that a node of a unit names, in a list; an empty list if it is not a length."""
     with suppress(ValueError, IndexError):
         return [snap_length(float(unit.texts[1]))]
     return []
 
 
 def snap_length(metres: float) -> float:
-    """Return the unit that a length [m] is up to rounding, or the length itself; ValueError if it is none."""
+    """Return the known unit [m] that equals a length up to rounding, or the length itself.
+
+    Raise ValueError if it is not a finite number above 0.
+    """
     if not (math.isfinite(metres) and metres > 0.0):
         raise ValueError(f"found a unit of {metres} m")
     return next((known for known in NAMES if abs(metres / known - 1.0) < UNIT_ROUNDING), metres)
 
 
 def read_geo_keys(keys: bytes) -> dict[int, tuple[int, int]]:
-    """Return where each GeoTIFF key has its value (0: in the key itself), and the value or its index."""
+    """Return, by GeoTIFF key, the record that holds its value (0: the key), and the value or its index."""
     entries = list(struct.iter_unpack("<4H", keys[: len(keys) // 8 * 8]))[1:]
     return {key: (place, value) for key, place, _, value in entries}
 
 
 def units_of_geo_keys(keys: bytes, doubles: bytes) -> Units:
-    """Return the units of a coordinate system in GeoTIFF keys; pyproj, if there, knows those of codes."""
+    """Return the units of a coordinate system in GeoTIFF keys; pyproj, if installed, knows most codes."""
     entries = read_geo_keys(keys)
     codes = {key: value for key, (place, value) in entries.items() if place == 0}
     system = codes.get(PROJECTED_KEY, 0)
@@ -157,7 +161,7 @@ def units_of_geo_keys(keys: bytes, doubles: bytes) -> Units:
 
 
 def _length_of_unit(code: int) -> float | None:
-    """Return the length [m] of a unit of EPSG; None if it is not known."""
+    """Return the length [m] of a unit by its EPSG code; None if it is not known."""
     if code in UNIT_CODES or not 0 < code < USER_DEFINED:
         return UNIT_CODES.get(code)
     with suppress(InputError):
@@ -168,7 +172,7 @@ def _length_of_unit(code: int) -> float | None:
 
 
 def _length_of_system(code: int) -> float | None:
-    """Return the unit [m] of a system of EPSG; None if it is not known, or pyproj is not there."""
+    """Return the unit [m] of a system by its EPSG code; None if it is unknown or pyproj is missing."""
     if not 0 < code < USER_DEFINED:
         return None
     with suppress(InputError):
@@ -180,9 +184,10 @@ def _length_of_system(code: int) -> float | None:
 
 
 def choose_units(units: Units, low: Axes, high: Axes) -> tuple[Axes, str]:
-    """Return the units of x, y, z [m] of a file within a box, and what is to be said of them.
+    """Return the units of x, y, z [m] of a file, and a note for the user, or "".
 
-    InputError if x and y are degrees, unless the box is too large for that.
+    `low` and `high` are the corners of the points' box. Raise InputError if x and y are degrees, unless the
+    box is too large for that.
     """
     if units.is_degrees:
         size = [b - a for a, b in zip(low[:2], high[:2], strict=True)]
@@ -197,25 +202,24 @@ def choose_units(units: Units, low: Axes, high: Axes) -> tuple[Axes, str]:
     up = units.up or across
     if units.unknown:
         why = f"it names {units.unknown}, whose unit is not known (pyproj knows most: extra gps)"
-        return (across, across, up), f"{why}: read in {_say(across, up)}; {OVERRULED}"
+        return (across, across, up), f"{why}: read in {_name_units(across, up)}; {OVERRULED}"
     if across == up == 1.0:
         return PLAIN, ""
     source = "its coordinate system says" if units.up else "its coordinate system says of x and y"
-    return (across, across, up), f"read in {_say(across, up)}, as {source}; {OVERRULED}"
+    return (across, across, up), f"read in {_name_units(across, up)}, as {source}; {OVERRULED}"
 
 
 def describe_foreign(units: Units) -> str:
-    """Say that a coordinate system names another unit than the metre, which the format demands; else ""."""
+    """Return a note if the coordinate system of an E57 file names another unit than the metre, else ""."""
     across = units.across or 1.0
     up = units.up or across
     if across == up == 1.0:
         return ""
-    return (
-        f"its coordinate system is in {_say(across, up)}, but E57 is in metres: read in metres; {OVERRULED}"
-    )
+    found = f"its coordinate system is in {_name_units(across, up)}"
+    return f"{found}, but E57 is in metres: read in metres; {OVERRULED}"
 
 
-def _say(across: float, up: float) -> str:
-    """Say in which units x and y, and z, are read."""
+def _name_units(across: float, up: float) -> str:
+    """Name the units in which x and y, and z, are read."""
     names = [NAMES.get(metres, f"units of {metres:.6g} m") for metres in (across, up)]
     return names[0] if across == up else f"{names[0]} across and {names[1]} up"

@@ -1,7 +1,7 @@
-"""Voxels in Morton order, on a grid that is fixed in the map's axes, averaged as the points stream by.
+"""Voxels in Morton order, on a grid that is fixed in the map's axes, averaged while the points are read.
 
-The memory grows with the scene, not with the points. All sums are integers: neither the order of the points
-nor their chunks change a bit, unless more than MAX_COUNT points are in one voxel.
+Memory grows with the size of the scene, not with the number of points. All sums are of integers: the order of
+the points and of the chunks does not change a bit, unless more than MAX_COUNT points are in one voxel.
 """
 
 from typing import NamedTuple
@@ -14,44 +14,44 @@ from ..system.jobs.memory import check_memory
 from ..system.kernels.jit import inline_kernel, kernel
 
 NUM_CELLS = 1 << 21  # along an axis; three axes fill 63 bits
-LEAF_SIZE = 0.02  # [m]
+LEAF_SIZE = 0.02  # [m] width of a voxel
 QUANTUM_BITS = 8  # a voxel is 256 quanta wide: positions are summed in steps of 78 um
 QUANTUM_MASK = (1 << QUANTUM_BITS) - 1
 QUANTA_PER_METRE = (1 << QUANTUM_BITS) / LEAF_SIZE
-WINDOW = (NUM_CELLS // 2) - 128  # cells from the median to those kept: 21 km
+WINDOW = (NUM_CELLS // 2) - 128  # cells from the median along an axis, 21 km: voxels farther away are dropped
 COARSEST = 128  # leaves along a voxel of the coarsest level
-# From a corner of all levels' grids to zero, in quanta: a third of the coarsest voxel, so that zero and whole
-# metres lie on no voxel's border. A floor at z = 0 would fall to both sides by its noise, and count twice.
+# [quanta] from a corner that the grids of all levels share to zero: a third of the coarsest voxel, so that
+# zero and whole metres lie on no voxel's border. Noise would put a floor on a border into two layers.
 PHASE = (COARSEST << QUANTUM_BITS) // 3 + 1
 
-JOINING_BYTES = 160  # a voxel, of which two clouds' are joined: nodes, cells, codes, order, sums
-VOXELS_AT_ONCE = 1 << 18  # voxels, whose temporary arrays stay small
+JOINING_BYTES = 160  # for each voxel of two clouds that are joined: nodes, cells, codes, order, sums
+VOXELS_AT_ONCE = 1 << 18  # voxels that are processed at once, so that temporary arrays stay small
 THIN = "set `units` if its unit is not the metre, or cut out a part"
 NUM_LEVELS = COARSEST.bit_length()  # from 128 leaves wide (2.56 m) down to one
 
 
-MAX_COUNT = 1 << 23  # points of a voxel that are summed, at most: int32 holds no more of their colours
-MAX_CELL = 1 << 31  # cells from the first point to any other, below this: 43,000 km
+MAX_COUNT = 1 << 23  # points of a voxel that are summed, at most: int32 can't hold the colours of more
+MAX_CELL = 1 << 31  # limit of the cells from the first point to any other: 43,000 km
 
-# columns of a voxel's row: cell, number of points, sums of quanta, sums of colours
+# first columns, in a voxel's row, of: cell (3), number of points, sums of quanta (3), sums of colours (3)
 CELL_COLUMN = 0
 COUNT_COLUMN = 3
 POSITION = 4
 COLOR = 7
 NUM_COLUMNS = 10
-FIRST_ROWS = 1 << 15
-MORE_ROWS = 8  # an eighth more at a time
-MAX_VOXELS = 80_000_000  # 20,000 m^2 or more
-MAX_LOAD = 0.4  # fraction of the index in use
+FIRST_ROWS = 1 << 15  # rows of a new table
+MORE_ROWS = 8  # a full table grows by the fraction 1 / MORE_ROWS
+MAX_VOXELS = 80_000_000  # enough for 20,000 m^2
+MAX_LOAD = 0.4  # of the index in use, at most
 TOGETHER = 256  # points whose rows are looked up together: memory answers many requests at a time
 ROW_BYTES = 4 * NUM_COLUMNS
 SLOT_BYTES = 4
-SORTED_BYTES = 3 * 8 + 6 * 4  # a voxel: codes, order, codes in order, nodes
+SORTED_BYTES = 3 * 8 + 6 * 4  # for each voxel: code, order, code in order, node
 
 
 @inline_kernel
 def spread_bits(cell: np.int64) -> np.int64:
-    """Return the lowest 21 bits of an int64, each followed by two zeros."""
+    """Return the lowest 21 bits of an int64, moved apart so that two zeros lie between neighbours."""
     bits = cell & 0x1FFFFF
     bits = (bits | (bits << 32)) & 0x1F00000000FFFF
     bits = (bits | (bits << 16)) & 0x1F0000FF0000FF
@@ -78,12 +78,12 @@ def morton_codes(cells: Int64s) -> Int64s:
 def morton_order(points: Array32, colors: Bytes) -> Int64s:
     """Return indices (N,) that sort points (N, 3) [m] and colours (N, 3) along Morton's curve.
 
-    The cells are cubes, 2^21 along the longest side of the bounding box. Within a cell coordinates and then
-    colours decide, so only points that are equal in every bit keep the order of the input.
+    The cells are cubes, 2^21 along the longest side of the bounding box. Within a cell points are sorted by
+    coordinates and then by colours, so only points that are equal in every bit keep the order of the input.
     """
     low = points.min(axis=0)
     extent = float((points.max(axis=0) - low).max())
-    # Rounded here, not in the kernel: fastmath may round the last, odd points of an array differently.
+    # Rounded here, not in a kernel: fastmath may round the last points of an array differently.
     cells_per_metre = np.float32((NUM_CELLS - 1) / max(extent, 1e-6))
     cells = np.minimum(((points - low) * cells_per_metre).astype(np.int64), NUM_CELLS - 1)
     codes = morton_codes(cells)
@@ -104,16 +104,16 @@ def morton_order(points: Array32, colors: Bytes) -> Int64s:
 class Voxels(NamedTuple):
     """The voxels that contain points, in Morton order."""
 
-    codes: Int64s  # (M,) Morton codes; the three lowest bits choose among a parent's children
-    nodes: Array32  # (M, 6) mean x, y, z [m] less `origin`, mean r, g, b in [0, 1]
-    origin: Array  # (3,) middle of their box in the map's axes, in whole metres
+    codes: Int64s  # (M,) Morton codes; their three lowest bits are the index among the parent's children
+    nodes: Array32  # (M, 6) mean x, y, z [m] relative to `origin`, mean r, g, b in [0, 1]
+    origin: Array  # (3,) [m] middle of their box in the map's axes, whole metres
     warnings: tuple[str, ...] = ()  # one line each, for the user
 
 
 def join_voxels(first: Array32, second: Array32, origin: Array) -> Voxels:
-    """Join the nodes (N, 6) of two clouds, relative to one origin (3,), to the voxels of both.
+    """Join the voxels of two clouds, given by nodes (N, 6) relative to the same origin (3,) [m].
 
-    A voxel that one cloud has keeps its bits; one that both have gets the mean of the two means.
+    A voxel of only one cloud keeps its bits; a voxel of both gets the mean of the two nodes.
     """
     num = len(first) + len(second)
     check_memory(num * JOINING_BYTES, f"the scan: sorting {num} voxels of 2 cm", THIN)
@@ -129,15 +129,15 @@ def join_voxels(first: Array32, second: Array32, origin: Array) -> Voxels:
 
 @inline_kernel
 def first_slot(index: Int32s, x: np.int64, y: np.int64, z: np.int64) -> np.int64:
-    """Return the slot where the search for a cell begins."""
-    # Teschner et al., VMV 2003. Products of less than 63 bits: none overflows, with or without Numba.
+    """Return the slot of the hash index at which the search for a cell begins."""
+    # Teschner et al., VMV 2003. Products have less than 63 bits, so none overflows, with or without Numba.
     mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
     return (mixed ^ (mixed >> 17)) & (len(index) - 1)
 
 
 @inline_kernel
 def find_slot(index: Int32s, rows: Int32s, slot: np.int64, x: np.int64, y: np.int64, z: np.int64) -> np.int64:
-    """Return the slot that holds a cell's row, or else the free slot where it belongs."""
+    """Return the slot that holds a cell's row, or the free slot in which it belongs."""
     while index[slot] != 0:
         row = rows[index[slot] - 1]
         if row[CELL_COLUMN] == x and row[CELL_COLUMN + 1] == y and row[CELL_COLUMN + 2] == z:
@@ -148,7 +148,7 @@ def find_slot(index: Int32s, rows: Int32s, slot: np.int64, x: np.int64, y: np.in
 
 @inline_kernel
 def locate_cell(quanta: Int64s) -> tuple[np.int64, np.int64, np.int64]:
-    """Return the cell of a point by its quanta (3,) from the base."""
+    """Return the cell of a point, given its quanta (3,) from the base."""
     return quanta[0] >> QUANTUM_BITS, quanta[1] >> QUANTUM_BITS, quanta[2] >> QUANTUM_BITS
 
 
@@ -156,9 +156,9 @@ def locate_cell(quanta: Int64s) -> tuple[np.int64, np.int64, np.int64]:
 def look_up(
     points: Array, base: Int64s, index: Int32s, rows: Int32s, quanta: Int64s, slots: Int64s, found: Int32s
 ) -> None:
-    """Write the quanta (3, n) from the base of points (n, 3), and the first slot (n,) of each point's cell.
+    """Write the quanta (3, n) of points (n, 3) [m] from the base, and the first slot (n,) of each one's cell.
 
-    What these slots name is read, so that it is in the processor's cache; `found` (n,) takes it.
+    The rows that these slots name are read into `found` (n,), only so that they are in the processor's cache.
     """
     for k in range(3):
         for i in range(len(points)):
@@ -177,7 +177,7 @@ def look_up(
 def enter_cells(
     quanta: Int64s, slots: Int64s, index: Int32s, rows: Int32s, num_voxels: int, found: Int32s
 ) -> tuple[int, int]:
-    """Write the row (n,) of each point's cell, made if it is missing; return the counts of `add_points`."""
+    """Write the row (n,) of each point's cell, made if it is missing; return as `add_points` does."""
     for i in range(len(found)):
         x, y, z = locate_cell(quanta[:, i])
         if num_voxels == len(rows) or max(abs(x), abs(y), abs(z)) >= MAX_CELL:
@@ -201,9 +201,9 @@ def add_points(
 ) -> tuple[int, int]:
     """Add points (N, 3) [m] with colours (N, 3) to the rows (n, 10) of `num_voxels` voxels.
 
-    `index` (2^k,), by a hash of the cells, holds the number of a cell's row plus 1, and 0 in free slots. Stop
-    at a point farther away than the cells reach, or when no row is left. Return the numbers of points added
-    and of voxels.
+    `index` (2^k,) is a hash index of the cells: it holds the index of a cell's row plus 1, and 0 in free
+    slots. Stop at a point that is farther from the base than MAX_CELL, or when no row is left. Return the
+    number of points that were added and the number of voxels.
     """
     quanta = np.empty((3, TOGETHER), np.int64)
     slots = np.empty(TOGETHER, np.int64)
@@ -237,7 +237,7 @@ def fill_index(rows: Int32s, num_voxels: int, index: Int32s) -> None:
 
 
 class VoxelTable:
-    """Sums over the points in each voxel: rows in the order of the first points, and an open hash index."""
+    """Sums over the points in each voxel: rows in the order of the first points, and a hash index."""
 
     def __init__(self, label: str) -> None:
         self.label = label  # of the cloud, for messages
@@ -248,7 +248,7 @@ class VoxelTable:
 
     def add(self, points: Array, colors: Bytes) -> None:
         """Add finite points (N, 3) [m], in the map's axes, with colours (N, 3)."""
-        points = np.ascontiguousarray(points)  # one kernel for all
+        points = np.ascontiguousarray(points)  # so that the kernel is compiled once
         colors = np.ascontiguousarray(colors)
         if self.num_voxels == 0 and len(points):
             self.base = np.floor(points[0] / LEAF_SIZE).astype(np.int64)
@@ -271,12 +271,12 @@ class VoxelTable:
         if self.num_voxels == len(self.rows):
             num_more = max(FIRST_ROWS, len(self.rows) // MORE_ROWS)
             self._check_memory(num_more * ROW_BYTES)
-            # Where pages can be mapped elsewhere (Linux), nothing is copied; elsewhere all is, for a moment.
+            # Linux can move the pages to another address; other systems copy all rows.
             self.rows.resize((len(self.rows) + num_more, NUM_COLUMNS), refcheck=False)
         if self.num_voxels >= int(MAX_LOAD * len(self.index)):
             num_slots = 2 * len(self.index)
             self._check_memory(num_slots * SLOT_BYTES)
-            self.index = np.zeros(0, np.int32)  # its room is needed
+            self.index = np.zeros(0, np.int32)  # first frees its memory
             self.index = np.zeros(num_slots, np.int32)
             fill_index(self.rows, self.num_voxels, self.index)
 
@@ -284,7 +284,7 @@ class VoxelTable:
         check_memory(num_bytes, f"{self.label}: a table of more than {self.num_voxels} voxels of 2 cm", THIN)
 
     def finish(self) -> Voxels:
-        """Return the means, without voxels too far away for a Morton code; the table can't be used again."""
+        """Return the voxels, without those too far away for a Morton code; the table can't be used again."""
         num = self.num_voxels
         self.index = np.zeros(0, np.int32)
         check_memory(num * SORTED_BYTES, f"{self.label}: sorting {num} voxels of 2 cm", THIN)
@@ -313,7 +313,7 @@ class VoxelTable:
         return Voxels(codes[order], nodes, origin, warnings)
 
     def _without_far(self, rows: Int32s) -> tuple[Int32s, tuple[str, ...]]:
-        """Return the rows of voxels near the rest, and a warning if others were left out."""
+        """Return the rows of voxels within WINDOW of the median, and a warning if others are left out."""
         is_near = np.ones(len(rows), dtype=np.bool_)
         for column in rows[:, :COUNT_COLUMN].T:
             middle = int(np.partition(column, len(column) // 2)[len(column) // 2])

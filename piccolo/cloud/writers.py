@@ -1,4 +1,4 @@
-"""Writers of clouds, a chunk at a time: binary PLY; copies under a rigid transform, or in other colours."""
+"""Writers of clouds, a chunk at a time: binary PLY, transformed copies, and copies in other colours."""
 
 import math
 import shutil
@@ -25,22 +25,25 @@ TYPE_NAMES = {
     "f8": "double",
 }  # fmt: skip
 COLOR_NAMES = ("red", "green", "blue")
-MAX_DIGITS = 20  # of the number of vertices, for which the header keeps room
+MAX_DIGITS = 20  # of the number of vertices: the header has room for so many
 
-Rows = np.ndarray[Any, np.dtype[np.void]]  # structured, a field a property
+Rows = np.ndarray[Any, np.dtype[np.void]]  # structured array with a field for each property
 AXES = ("x", "y", "z")
 NORMALS = ("nx", "ny", "nz")
-MAX_LOSS = 1e-4  # of float32 coordinates by rounding [m]
+MAX_LOSS = 1e-4  # [m] by which rounding to float32 may move a point
 SUFFIXES = (".ply", ".las", ".laz", ".e57")
-UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])  # quaternion of a scan in the axes of its file
-LAS_STEP = 1e-4  # [m] of coordinates in LAS
-E57_BYTES = 45  # of a point, beside the array of it that is held, while the file is written
-Colors = tuple[Bytes, Bytes]  # RGB (N, 3), and how many photos (N,) gave each
+UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])  # quaternion (w, x, y, z) of the identity
+LAS_STEP = 1e-4  # [m] step of coordinates in LAS
+E57_BYTES = 45  # of memory for each point while the file is written, beside the array that is held
+Colors = tuple[Bytes, Bytes]  # RGB (N, 3), and the number (N,) of photos that gave each
 Add = Callable[[Array, Bytes, Bytes], None]  # points (N, 3) in the files' unit
 
 
 def vertex_rows(points: Floats, colors: Bytes | None, **more: Values | None) -> Rows:
-    """Return vertices with points (N, 3), of their own float type, colours (N, 3) RGB if any, more (N,)."""
+    """Return vertices with points (N, 3) in their own float type, and colours (N, 3) RGB if there are any.
+
+    `more` names further properties (N,); those that are None are left out.
+    """
     columns = dict(zip(AXES, points.T, strict=True))
     columns.update({} if colors is None else dict(zip(COLOR_NAMES, colors.T, strict=True)))
     columns.update((name, column) for name, column in more.items() if column is not None)
@@ -56,12 +59,12 @@ def _rows(columns: dict[str, Values], dtype: np.dtype[Any]) -> Rows:
 
 @dataclass
 class PlyWriter:
-    """A writer of vertices, chunk by chunk; all have the fields of the first."""
+    """A writer of vertices, chunk by chunk; all chunks have the fields of the first."""
 
-    file: IO[bytes]  # after the vertices the caller may write more elements, in little-endian order
+    file: IO[bytes]  # the caller may write more elements after the vertices, in little-endian order
     comments: Sequence[str]
-    more: Sequence[str]  # lines of the header for the elements after the vertices
-    dtype: np.dtype[Any] | None = None  # little-endian
+    more: Sequence[str]  # lines of the header for these elements
+    dtype: np.dtype[Any] | None = None  # of a vertex, little-endian; None before the first chunk
     num_vertices: int = 0
 
     def add(self, rows: Rows) -> None:
@@ -73,8 +76,8 @@ class PlyWriter:
         self.num_vertices += len(rows)
 
     def write_header(self) -> None:
-        """Write the header, of a fixed size, for the vertices so far."""
-        # The room that the number doesn't need stands in a comment: a padded number is not read everywhere.
+        """Write the header for the vertices so far; its size does not depend on their number."""
+        # A comment fills the room that the number doesn't need: some programs can't read a padded number.
         lines = ["ply", "format binary_little_endian 1.0"]
         lines.append("comment " + "." * (MAX_DIGITS - len(str(self.num_vertices))))
         lines += [f"comment {text}" for text in self.comments]
@@ -86,7 +89,7 @@ class PlyWriter:
 
 @contextmanager
 def writing_ply(path: Path, comments: Sequence[str] = (), more: Sequence[str] = ()) -> Iterator[PlyWriter]:
-    """Yield a writer of `path`, which is replaced when all is written and counted, and not after an error."""
+    """Yield a writer of `path`; the file is replaced after the block, or left as it was after an error."""
     with replacing(path) as file:
         writer = PlyWriter(file, comments, more)
         yield writer
@@ -95,9 +98,9 @@ def writing_ply(path: Path, comments: Sequence[str] = (), more: Sequence[str] = 
 
 
 def coordinate_type(box: Array, T_target_from_source: Array, scale: float) -> type[np.floating[Any]]:
-    """Return float64 if rounding to float32 would move a transformed box (2, 3) [m] by over MAX_LOSS.
+    """Return float64 if rounding to float32 could move a point of a transformed box by more than MAX_LOSS.
 
-    T is in units of `scale` metres.
+    Else return float32. The box (2, 3) is in metres, the transform (4, 4) in units of `scale` metres.
     """
     corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(8, 3)
     farthest = float(np.abs(transform_points(corners / scale, T_target_from_source)).max())
@@ -108,11 +111,12 @@ def coordinate_type(box: Array, T_target_from_source: Array, scale: float) -> ty
 def write_transformed(
     cloud: CloudStream, T_target_from_source: Array, out: Path, finish: Callable[[], None]
 ) -> tuple[str, ...]:
-    """Write a cloud, read once before, as binary PLY under a transform (4, 4) in units of `cloud.scale`.
+    """Write a cloud as binary PLY under a transform (4, 4) in units of `cloud.scale` metres.
 
-    One PLY file keeps its other properties and elements and its points with NaN, its normals are rotated; any
-    other cloud is written with x y z and red green blue, or intensity, or neither. `finish` runs when all is
-    written, just before `out` appears. Return a line for each element that was left out.
+    The cloud must have been read once before, as its box is needed. A single PLY file keeps its other
+    properties and elements and its points with NaN, and its normals are rotated. Any other cloud is written
+    with x y z and red green blue, or intensity, or neither. `finish` is called when all is written, just
+    before `out` appears. Return a line of text for each element that was left out.
     """
     path = cloud.sources[0].path
     with path.open("rb") as file:
@@ -134,15 +138,15 @@ def write_transformed(
 def _write_copy(
     cloud: CloudStream, header: PlyHeader, T_target_from_source: Array, out: Path, finish: Callable[[], None]
 ) -> tuple[str, ...]:
-    """Copy one PLY file with all that it holds; return a line for each element that was left out.
+    """Write a transformed copy of a PLY file; return a line of text for each element that was left out.
 
-    Elements after the vertices are copied as bytes, so those of ASCII and big-endian files are left out, as
-    are elements before the vertices.
+    Elements after the vertices are copied byte by byte; those of ASCII and big-endian files are left out, and
+    so are elements before the vertices.
     """
     full = [k for k, count in enumerate(header.counts) if count and k != header.index]
     copied = [k for k in full if k > header.index and header.byte_order == "<"]
     more: list[str] = []
-    for k in copied:  # with its count, which plyfile was not given
+    for k in copied:  # with its count: plyfile read the header with counts of 0
         element = header.elements[k]
         more += [f"element {element.name} {header.counts[k]}", *map(str, element.properties)]
     found = header.vertices.dtype("<")
@@ -170,7 +174,7 @@ def _write_copy(
 
 
 def _of_type(column: Values, dtype: np.dtype[Any]) -> Values:
-    """Return a column in the type that the file declares; that of an ASCII file was read as float64."""
+    """Return a column in the type that the file declares; columns of ASCII files are read as float64."""
     if dtype.kind in "iu" and column.dtype.kind == "f":
         limits = np.iinfo(dtype)
         column = np.clip(np.nan_to_num(np.rint(column)), limits.min, limits.max)
@@ -178,7 +182,7 @@ def _of_type(column: Values, dtype: np.dtype[Any]) -> Values:
 
 
 def _transform(columns: dict[str, Values], T_target_from_source: Array) -> dict[str, Values]:
-    """Return the columns of vertices with x y z transformed, nx ny nz rotated, and all else unchanged."""
+    """Return the columns of vertices with x y z transformed, nx ny nz rotated, and all others unchanged."""
     turn = T_target_from_source.copy()
     turn[:3, 3] = 0.0
     target = columns.copy()
@@ -190,13 +194,13 @@ def _transform(columns: dict[str, Values], T_target_from_source: Array) -> dict[
 
 
 def describe_unit(cloud: CloudStream, out: Path, crs: str = "") -> tuple[str, ...]:
-    """Return a line on a written file that is in another unit than the metre and does not say so.
+    """Return a line of text if a written file has another unit than the metre and does not name it.
 
-    Only where the scan's files told the unit: a user who gave it knows it.
+    There is none if the user gave the unit, only if it is from the scan's files.
     """
-    is_told = any(source.unit_note for source in cloud.sources)
-    says_it = bool(crs) and out.suffix.lower() in (".las", ".laz")
-    if not is_told or says_it or cloud.scale == 1.0:
+    is_by_files = any(source.unit_note for source in cloud.sources)
+    is_named = bool(crs) and out.suffix.lower() in (".las", ".laz")
+    if not is_by_files or is_named or cloud.scale == 1.0:
         return ()
     names = [name for name, metres in METRES.items() if metres == cloud.scale]
     unit = names[0] if names else repr(cloud.scale)
@@ -206,11 +210,12 @@ def describe_unit(cloud: CloudStream, out: Path, crs: str = "") -> tuple[str, ..
 def write_colored(
     cloud: CloudStream, color: Callable[[Array], Colors], box_world: Array, out: Path, crs: str = ""
 ) -> tuple[int, int]:
-    """Write a cloud within a box (2, 3) [m] in the colours of `color(points_world)`, by the suffix of `out`.
+    """Write a cloud in other colours, in the format that the suffix of `out` names.
 
-    Points (N, 3) [m] are coloured, and written in the files' unit and order with the number of photos that
-    gave the colour: PLY's `photos`, LAS's user data. Where units differ, it is in metres, without the
-    coordinate system. Return the numbers of points, and of coloured ones.
+    `color` takes points (N, 3) [m] of the world and returns their colours, with the number of photos that
+    gave each. The points, which lie in a box (2, 3) [m], are written in the unit and order of the files; the
+    number of photos is PLY's property `photos` or LAS's user data. If units differ, the file is in metres and
+    has no coordinate system. Return the number of points, and of those that a photo coloured.
     """
     crs = crs if len(cloud.units) == 1 else ""
     num_points = num_colored = 0
@@ -236,7 +241,7 @@ def writing_ply_rows(out: Path, box: Array, scale: float, _crs: str) -> Iterator
 
 @contextmanager
 def writing_las(out: Path, box: Array, scale: float, crs: str) -> Iterator[Add]:
-    """Yield a function that adds points to a LAS or LAZ file, in its coordinate system if one is known."""
+    """Yield a function that adds points to a LAS or LAZ file, which names the coordinate system `crs`."""
     laspy = import_optional(out, "laspy")
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.scales = np.full(3, LAS_STEP / scale)
@@ -265,10 +270,10 @@ def writing_las(out: Path, box: Array, scale: float, crs: str) -> Iterator[Add]:
 
 @contextmanager
 def writing_e57(out: Path, box: Array, _scale: float, _crs: str) -> Iterator[Add]:
-    """Yield a function that adds points to an E57 file, whose library wants all of them at once."""
+    """Yield a function that adds points to an E57 file; all are written at once, after the block."""
     pye57 = import_optional(out, "pye57")
     failed = pye57.libe57.E57Exception
-    middle = np.floor(box.mean(axis=0))  # coordinates are written in float32
+    middle = np.floor(box.mean(axis=0))  # subtracted, as coordinates are written in float32
     parts: list[tuple[Any, ...]] = []
 
     def add(points: Array, colors: Bytes, _num_photos: Bytes) -> None:
@@ -286,5 +291,5 @@ def writing_e57(out: Path, box: Array, _scale: float, _crs: str) -> Iterator[Add
             writer.write_scan_raw(data, name="coloured", rotation=UNTURNED, translation=middle)
             writer.close()
         except failed:
-            writer.close = lambda: None  # it would be closed once more, and the error printed
+            writer.close = lambda: None  # else pye57 closes it once more and prints the error
             raise

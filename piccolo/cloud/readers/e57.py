@@ -1,4 +1,4 @@
-"""E57 files, decoded by libE57: the coloured points of all scans, each at its pose, and the images."""
+"""E57 files, decoded by libE57: the coloured points of all scans, each placed by its pose, and the images."""
 
 import math
 import re
@@ -25,15 +25,16 @@ CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 COLORS = ("colorRed", "colorGreen", "colorBlue")
 INTENSITY = "intensity"
-INVALID = {  # fields that are 0 in valid points
+INVALID = {  # fields that are 0 for valid points, by the fields that they qualify
     CARTESIAN: "cartesianInvalidState",
     SPHERICAL: "sphericalInvalidState",
     COLORS: "isColorInvalid",
     (INTENSITY,): "isIntensityInvalid",
 }
-OPEN = {"Float": (1.0, 1.0)}  # ranges that follow from the values: the usual brightest one, twice
-WIDE_RANGES = RANGES[-1], RANGES[-1]  # of whole numbers
-COLOR_TOLERANCE = 0.01  # of 255, what a float colour may lie outside of its range
+# ranges of colours that a file leaves open, to be found from the values: the usual full brightness, twice
+OPEN = {"Float": (1.0, 1.0)}
+WIDE_RANGES = RANGES[-1], RANGES[-1]  # the same for whole numbers
+COLOR_TOLERANCE = 0.01  # of 255, by which a float colour may lie outside of its range
 CHANNELS: dict[Channel, tuple[str, ...]] = {"colors": COLORS, "intensity": (INTENSITY,), "shape": ()}
 WANTED: dict[Channel, str] = {
     "colors": "wanted scans with colorRed colorGreen colorBlue",
@@ -47,6 +48,7 @@ KINDS = {
     "visual-reference": "visualReferenceRepresentation",
 }
 SUFFIX = {"jpeg": ".jpg", "png": ".png"}
+# first bytes of an image file
 ENCODINGS = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}
 MAX_IMAGE_SIDE = 1 << 20  # [px]
 
@@ -55,27 +57,27 @@ MAX_IMAGE_SIDE = 1 << 20  # [px]
 class E57Scan:
     """One scan of a file."""
 
-    index: int
+    index: int  # in the file's data3D
     label: str  # for messages
     num_points: int
     coordinates: tuple[str, ...]  # CARTESIAN or SPHERICAL
-    channels: tuple[str, ...]  # COLORS, or INTENSITY alone, or none
-    invalid: tuple[str, ...]  # of INVALID
-    color_ranges: tuple[tuple[float, float], ...]  # of each channel; none: the intensity is read
-    pose: Pose | None  # the scanner is the camera
+    channels: tuple[str, ...]  # COLORS, or INTENSITY alone, or empty
+    invalid: tuple[str, ...]  # the fields of INVALID that the scan has
+    color_ranges: tuple[tuple[float, float], ...]  # black and full brightness by channel; empty: no colours
+    pose: Pose | None  # of the scanner, as a camera's
 
 
 class _UnusableError(Exception):
-    """A scan is intact, but can't be used."""
+    """A scan is intact but can't be used; the message is what follows its label."""
 
 
 def open_e57(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
     """Return the points of all scans of an E57 file that have colours, or another channel.
 
-    Points with an invalid state (direction only, or nothing) or an invalid colour are left out. A colour's
-    range is the scan's colorLimits, or else that of the field's declaration; one of 16 bits or more may have
-    room to spare: then the values decide, as in all formats. If only some scans have the channel, the others
-    are left out, with a warning.
+    Points with an invalid state (direction only, or nothing) or an invalid colour are left out. The range of
+    colours is the scan's colorLimits, or else that which the field declares. A declared range of 16 bits or
+    more may be wider than the values: then the values decide, as in all formats. If only some scans have the
+    channel, the others are left out, with a warning.
     """
     with open_file(path) as file:
         scans, left_out = _scans(file, CHANNELS[channel])
@@ -87,7 +89,7 @@ def open_e57(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "c
     num_points = sum(scan.num_points for scan in scans)
     source = reader.make_source(path, partial(_read, path, scans), channel, options, num_points)
     poses = [scan.pose for scan in scans if scan.pose is not None]
-    # programs that know of no scanner write the identity
+    # an identity is no scanner's pose: programs write it if they know none
     placed = [p for p in poses if not np.array_equal(p.R_cam_from_world, np.eye(3)) or p.center_world.any()]
     return source._replace(
         warnings=(*(f"{path}: {what}; left out" for what in left_out), *notes),
@@ -111,7 +113,7 @@ def _scans(file: E57File, channels: tuple[str, ...]) -> tuple[list[E57Scan], lis
 
 
 def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int, label: str) -> E57Scan:
-    """Return the description of a scan; _UnusableError if it can't be used."""
+    """Return the description of a scan. Raise _UnusableError if it can't be used."""
     points = element.find("points")
     prototype = element.find("points/prototype")
     if points is None or prototype is None or points.get("type") != "CompressedVector":
@@ -148,7 +150,7 @@ def _num_bits(path: Path, field: Element) -> int:
 
 
 def _color_range(path: Path, element: Element, field: Element) -> tuple[float, float]:
-    """Return the values of black and of full brightness of a channel."""
+    """Return a channel's values of black and of full brightness; both equal if the values must decide."""
     name = field.tag
     low = read_number(path, element, f"colorLimits/{name}Minimum")
     high = read_number(path, element, f"colorLimits/{name}Maximum")
@@ -164,7 +166,7 @@ def _color_range(path: Path, element: Element, field: Element) -> tuple[float, f
 
 
 def _set_ranges(file: E57File, scans: list[E57Scan], settings: CloudSettings) -> tuple[str, ...]:
-    """Set the ranges of colours that the file leaves open, in place; return warnings."""
+    """Replace, in the list, scans whose colours have an open range by those with one; return warnings."""
     notes: list[str] = []
     for k, scan in enumerate(scans):
         usual = next((high for low, high in scan.color_ranges if low == high), None)
@@ -183,7 +185,7 @@ def _set_ranges(file: E57File, scans: list[E57Scan], settings: CloudSettings) ->
 
 
 def _read(path: Path, scans: list[E57Scan]) -> Iterator[reader.Part]:
-    """Yield the valid points (N, 3) of each scan, in the world, and their channels."""
+    """Yield the valid points (N, 3) of each scan, in the world, and their colours or intensity."""
     with open_file(path) as file:
         for scan in scans:
             for columns in _read_scan(file, scan):
@@ -218,7 +220,7 @@ def _colors(path: Path, scan: E57Scan, columns: dict[str, Array]) -> Bytes:
 
 
 def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
-    """Yield the columns of a scan, a chunk at a time, in arrays that the next chunk overwrites."""
+    """Yield the columns of a scan, a chunk at a time; the next chunk overwrites the arrays."""
     names = (*scan.coordinates, *scan.channels, *scan.invalid)
     columns = {name: np.empty(min(scan.num_points, POINTS_A_CHUNK)) for name in names}
     buffers = file.libe57.VectorSourceDestBuffer()
@@ -241,17 +243,17 @@ def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
 class E57Image(NamedTuple):
     """One representation of one image of a file."""
 
-    file_name: str  # of what tools/e57_images.py writes
+    file_name: str  # of the file that tools/e57_images.py writes
     name: str
-    kind: str  # of KINDS
-    encoding: str  # of ENCODINGS
+    kind: str  # a key of KINDS
+    encoding: str  # a key of ENCODINGS
     size: int  # [byte]
     width: int  # [px]
     height: int  # [px]
     fov_deg: tuple[float, float] | None  # of a spherical image, across and down
     pose: Pose | None
     pinhole: tuple[float, ...]  # focal lengths and principal point [px] of a pinhole image, or empty
-    scan_guid: str  # of the scan it belongs to, or empty
+    scan_guid: str  # of the scan to which it belongs, or empty
     node: tuple[int, str, str]  # index in images2D, names of the representation and the blob
 
 
@@ -277,7 +279,7 @@ def read_image(path: Path, index: int) -> bytes:
 
 
 def _images(file: E57File) -> Iterator[E57Image]:
-    """Yield the representations, of the elements of images2D, that contain an image."""
+    """Yield those representations of the elements of images2D that contain an image file."""
     elements = enumerate(file.root.findall("images2D/*"))
     for (number, element), (kind, place), encoding in product(elements, KINDS.items(), ENCODINGS):
         representation = element.find(place)
@@ -285,7 +287,7 @@ def _images(file: E57File) -> Iterator[E57Image]:
         if representation is None or blob is None or blob.get("type") != "Blob":
             continue
         size = parse_integer(file.path, blob.get("length", ""))
-        if not 0 < size <= file.size:  # libE57 reserves it
+        if not 0 < size <= file.size:  # libE57 allocates it
             found = f"promises {size} bytes, found a file of {file.size} bytes"
             raise InputError(f"{file.path}: image {number} {found}; it is broken")
         width = _side(file.path, representation, "imageWidth")
@@ -312,7 +314,10 @@ def _images(file: E57File) -> Iterator[E57Image]:
 
 
 def _pinhole(path: Path, representation: Element, across: float, down: float) -> tuple[float, ...]:
-    """Return fx, fy, cx, cy [px] from lengths [m] of an image and its pixels; empty if one is missing."""
+    """Return fx, fy, cx, cy [px] of a pinhole image; empty if its focal length or a pixel size is missing.
+
+    `across` and `down` [m] are the width and the height of a pixel.
+    """
     names = "focalLength", "principalPointX", "principalPointY"
     focal, *center = (read_number(path, representation, name) or 0.0 for name in names)
     return (focal / across, focal / down, *center) if min(focal, across, down) > 0.0 else ()

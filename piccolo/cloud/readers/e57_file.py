@@ -1,7 +1,7 @@
 """Parts of E57 files that scans and images share: header, XML section, numbers, poses.
 
-The XML is read here, within limits, before libE57 opens the file: libE57's parser would follow a document
-type definition or a schema to other files, and has no limit on depth and number of elements.
+The XML is parsed here, within limits, before libE57 opens the file: libE57's parser would load other files
+that a document type definition or a schema names, and has no limit on the depth and number of elements.
 """
 
 import math
@@ -24,16 +24,16 @@ from .reader import quote_line
 MAGIC = b"ASTM-E57"
 HEADER = struct.Struct("<8sIIQQQQ")  # magic, major, minor, file size, XML offset, XML size, page size
 PAGE_SIZE = 1024  # [byte]
-PAGE_CONTENT = 1020  # [byte]; the rest of a page is its checksum
+PAGE_CONTENT = 1020  # [byte] of a page; the rest is its checksum
 NAMESPACE = "{http://www.astm.org/COMMIT/E57/2010-e57-v1.0}"
 MAX_XML_SIZE = 1 << 26  # [byte]
-# libE57 takes time with the square of a structure's parts; a vector holds scans and images
+# libE57's time grows with the square of the elements in a structure; vectors hold scans and images
 MAX_ELEMENTS = 500_000
 MAX_XML_PARTS = 500
 MAX_IN_VECTOR = 20_000
 MAX_XML_DEPTH = 32
 INTEGER = re.compile(r"[+-]?[0-9]{1,19}")
-CHECK_ALL = 100  # [%] of the pages have their checksum verified
+CHECK_ALL = 100  # [%] of the pages whose checksums libE57 verifies
 
 
 class E57File(NamedTuple):
@@ -41,9 +41,9 @@ class E57File(NamedTuple):
 
     path: Path
     size: int  # [byte]
-    root: Element
+    root: Element  # of the XML
     libe57: ModuleType
-    image_file: Any
+    image_file: Any  # libE57's object of the open file
 
 
 @contextmanager
@@ -64,7 +64,7 @@ def refusing(path: Path, libe57: ModuleType) -> Iterator[None]:
     """Turn libE57's errors on a broken file into an InputError."""
     try:
         yield
-    except (libe57.E57Exception, RuntimeError, UnicodeDecodeError) as error:  # the last in its own message
+    except (libe57.E57Exception, RuntimeError, UnicodeDecodeError) as error:  # the last: a bad message
         raise InputError(f"{path}: broken E57 file ({quote_line(str(error).encode())})") from error
 
 
@@ -79,7 +79,7 @@ def read_e57_crs(path: Path) -> str:
 
 
 def read_section(path: Path) -> bytes:
-    """Return a file's XML section; InputError if the header is damaged."""
+    """Return a file's XML section, without checksums. Raise InputError if the header is damaged."""
     with path.open("rb") as file:
         head = file.read(HEADER.size)
         if len(head) < HEADER.size or not head.startswith(MAGIC):
@@ -102,12 +102,12 @@ def read_section(path: Path) -> bytes:
 
 
 class _Limited(TreeBuilder):
-    """A builder of a tree of elements within limits, which refuses references to other files."""
+    """A builder of the element tree that keeps to limits and refuses references to other files."""
 
     def __init__(self) -> None:
         super().__init__()
         self.num_elements = 0
-        self.room = [1]  # for children, in each open element
+        self.room = [1]  # how many more children each open element may have
 
     def start(self, tag: str, attrs: dict[str, str]) -> Element:
         """Open an element."""
@@ -129,7 +129,7 @@ class _Limited(TreeBuilder):
         return super().end(tag.removeprefix(NAMESPACE))
 
     def doctype(self, *_: str | None) -> None:
-        """Refuse a document type, where entities are declared."""
+        """Refuse a document type definition, which could declare entities."""
         raise ValueError("a document type definition")
 
 
@@ -146,13 +146,13 @@ def _parse_xml(path: Path, xml: bytes) -> Element:
 
 
 def read_number(path: Path, element: Element, place: str) -> float | None:
-    """Return the number in the element at a place below another, 0 if it is empty; None without one."""
+    """Return the number in the element at a path below another: 0 if that is empty, None if it is missing."""
     found = element.find(place)
     return None if found is None else read_scaled(path, found, (found.text or "").strip() or "0")
 
 
 def read_scaled(path: Path, element: Element, text: str) -> float:
-    """Return the number of a text in an element, scaled if that is a scaled integer's."""
+    """Return the number in an element's text, scaled if the element is a ScaledInteger."""
     value = parse_number(path, text)
     if element.get("type") != "ScaledInteger":
         return value
@@ -161,7 +161,7 @@ def read_scaled(path: Path, element: Element, text: str) -> float:
 
 
 def parse_number(path: Path, text: str) -> float:
-    """Parse a finite number; InputError if the text is none."""
+    """Parse a finite number. Raise InputError if the text is none."""
     try:
         value = float(text)
     except ValueError:
@@ -173,14 +173,14 @@ def parse_number(path: Path, text: str) -> float:
 
 
 def parse_integer(path: Path, text: str) -> int:
-    """Parse an integer of 64 bits or little more; InputError if the text is none."""
+    """Parse an integer of at most 19 digits. Raise InputError if the text is none."""
     if not INTEGER.fullmatch(text):
         raise InputError(f"{path}: found {quote_line(text.encode())} in the XML section, wanted an integer")
     return int(text)
 
 
 def pose_of(path: Path, element: Element) -> Pose | None:
-    """Return the pose of a scan or an image; None if it has none. Missing parts are the identity's."""
+    """Return the pose of a scan or an image, or None. A missing rotation or translation is the identity's."""
     if element.find("pose") is None:
         return None
     q = np.eye(4)[0]

@@ -1,7 +1,7 @@
 """The JSON of a glTF file, changed so that trimesh reads it as the specification says.
 
-trimesh reads sparse and compressed data as zeros and whole numbers as they are, knows one set of texture
-coordinates, makes bytes of base colours, and gives the parts of a mesh names by chance.
+By itself trimesh reads sparse and compressed data as zeros, does not scale whole numbers to fractions, knows
+only one set of texture coordinates, rounds base colours to bytes, and gives random names to parts of a mesh.
 """
 
 import json
@@ -15,9 +15,8 @@ from ...system.errors import InputError
 
 GLB_MAGIC = b"glTF"
 WANTED = "wanted a whole glTF 2.0 mesh"
-KNOWN_EXTENSIONS = frozenset(
-    {"KHR_materials_unlit", "EXT_texture_webp", "KHR_mesh_quantization"}
-)  # of those a file may require
+# extensions that a file may require, and extensions that would change colours but are not read
+KNOWN_EXTENSIONS = frozenset({"KHR_materials_unlit", "EXT_texture_webp", "KHR_mesh_quantization"})
 UNREAD_EXTENSIONS = frozenset({"KHR_materials_pbrSpecularGlossiness", "KHR_texture_transform"})
 FLOAT = 5126
 POINTS = 0
@@ -31,19 +30,20 @@ Json = dict[str, Any]
 class Material(NamedTuple):
     """The base colour of a glTF material."""
 
-    factor: tuple[float, float, float] = (1.0, 1.0, 1.0)  # linear light
-    texture: Json | None = None
+    factor: tuple[float, float, float] = (1.0, 1.0, 1.0)  # linear light, times the texture
+    texture: Json | None = None  # the JSON that refers to it
 
 
-NO_MATERIAL = Material()  # of primitives without one, the first of all
+NO_MATERIAL = Material()  # of primitives without a material; index 0 of the list of materials
 
 
 def prepare_gltf(
     path: Path, content: bytes, read_file: Callable[[str], bytes]
 ) -> tuple[bytes, list[Material]]:
-    """Return a glTF or GLB file with triangles, base colours and nodes only, and its materials.
+    """Return a glTF or GLB file reduced to triangles, base colours and nodes, and the list of its materials.
 
-    In the file the materials are named by their index in the list. `read_file` returns a file that it names.
+    The name of a material in the file is its index in the list. `read_file` returns the content of a file
+    that this file names.
     """
     head, text, data = _split(path, content)
     try:
@@ -57,7 +57,7 @@ def prepare_gltf(
         for image in _name_files(tree["images"]):
             read_file(image["uri"])
         for node in tree.get("nodes", []):
-            node.pop("camera", None)  # with which trimesh passes over the node's mesh
+            node.pop("camera", None)  # trimesh ignores the mesh of a node with a camera
             node.pop("name", None)  # trimesh before 5 mixes up nodes named "world"
         text = json.dumps(tree).encode()
     except InputError:
@@ -89,7 +89,7 @@ def _check_version(path: Path, tree: Json) -> None:
 
 
 def _check_files(path: Path, tree: Json, read_file: Callable[[str], bytes]) -> None:
-    """Refuse buffers that were cut, and data of which trimesh would make zeros."""
+    """Refuse buffers that are cut off, and data that trimesh would read as zeros."""
     for buffer in _name_files(tree.get("buffers", [])):
         num_bytes = len(read_file(buffer["uri"]))
         if num_bytes < buffer["byteLength"]:
@@ -101,7 +101,7 @@ def _check_files(path: Path, tree: Json, read_file: Callable[[str], bytes]) -> N
 
 
 def _name_files(entries: list[Json]) -> Iterator[Json]:
-    """Yield the entries that name files; decode the names, which trimesh does not."""
+    """Yield the entries that name files, with the names percent-decoded, which trimesh does not do."""
     for entry in entries:
         if not entry.get("uri", "data:").startswith("data:"):
             entry["uri"] = unquote(entry["uri"])
@@ -120,8 +120,8 @@ def _material(path: Path, material: Json) -> Material:
 
 def _keep_base_colors(tree: Json, materials: list[Material]) -> None:
     """Remove all images but those of base colours; name materials by their index."""
-    shown = [tree["textures"][m.texture["index"]] for m in materials if m.texture is not None]
-    used = {t.get("extensions", {}).get("EXT_texture_webp", t)["source"] for t in shown}
+    textures = [tree["textures"][m.texture["index"]] for m in materials if m.texture is not None]
+    used = {t.get("extensions", {}).get("EXT_texture_webp", t)["source"] for t in textures}
     tree["images"] = [image if i in used else {} for i, image in enumerate(tree.get("images", []))]
     tree["materials"] = [
         {"name": str(i), "pbrMetallicRoughness": {"baseColorTexture": material.texture}}
@@ -130,26 +130,26 @@ def _keep_base_colors(tree: Json, materials: list[Material]) -> None:
 
 
 def _keep_triangles(path: Path, tree: Json, materials: list[Material]) -> None:
-    """Remove all primitives but those of triangles, or points if there are no triangles."""
+    """Remove all primitives but triangles, or all but points if there are no triangles."""
     meshes = tree.get("meshes", [])
     modes = {p.get("mode", TRIANGLES) for mesh in meshes for p in mesh["primitives"]}
     if FAN in modes:
         raise InputError(f"{path}: has triangle fans, wanted triangles")
     wanted = modes & {TRIANGLES, TRIANGLE_STRIP} or {POINTS}
     for mesh in meshes:
-        shown = [p for p in mesh["primitives"] if p.get("mode", TRIANGLES) in wanted]
-        kept = [_primitive(path, tree["accessors"], materials, primitive) for primitive in shown]
+        chosen = [p for p in mesh["primitives"] if p.get("mode", TRIANGLES) in wanted]
+        kept = [_primitive(path, tree["accessors"], materials, primitive) for primitive in chosen]
         mesh.clear()
         mesh["primitives"] = kept
 
 
 def _primitive(path: Path, accessors: list[Json], materials: list[Material], primitive: Json) -> Json:
-    """Return a primitive with only its positions, colours and the base colour's uv."""
+    """Return a primitive with only its positions, colours and texture coordinates of the base colour."""
     row = primitive["material"] + 1 if "material" in primitive else 0
     texture = materials[row].texture
     sources = {"POSITION": "POSITION", "COLOR_0": "COLOR_0"}
     if texture is not None:
-        sources["TEXCOORD_0"] = f"TEXCOORD_{texture.get('texCoord', 0)}"  # the only one that trimesh reads
+        sources["TEXCOORD_0"] = f"TEXCOORD_{texture.get('texCoord', 0)}"  # trimesh reads only TEXCOORD_0
     given = primitive["attributes"]
     attributes = {name: given[source] for name, source in sources.items() if source in given}
     for name in attributes.keys() - {"COLOR_0"}:
@@ -161,7 +161,7 @@ def _primitive(path: Path, accessors: list[Json], materials: list[Material], pri
 
 
 def _split_meshes(tree: Json) -> None:
-    """Place each primitive by a node of its own: trimesh names those of one mesh by chance, some alike."""
+    """Give each primitive a mesh and a node of its own: trimesh's names for those of one are random."""
     parts: list[Json] = []
     nodes: list[Json] = tree.get("nodes", [])
     splits: list[list[int]] = []

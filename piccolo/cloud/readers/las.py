@@ -1,4 +1,4 @@
-"""LAS and LAZ files: positions and colours or intensities, decompressed by laspy with lazrs."""
+"""LAS and LAZ files: positions with colours or intensities; laspy with lazrs decompresses LAZ."""
 
 import logging
 from collections.abc import Iterator
@@ -16,28 +16,28 @@ from . import reader
 from .las_file import VLR_HEADER, WANTED, LasHeader, find_units, read_las_header
 from .reader import MAX_BLOCK_SIZE, POINTS_A_CHUNK, MissingChannelError, PointSource, quote_line
 
-# What is wanted of formats 6 to 10, where fields can be passed over.
+# The fields that are decompressed in point formats 6 to 10, where others can be skipped.
 SELECTED = ("XY_RETURNS_CHANNEL", "Z", "INTENSITY", "FLAGS", "RGB")
-# Of the flags' byte the bit of withheld points.
-WITHHELD_OLD = 0x80  # in the formats 0-5
-WITHHELD = 0x04  # in 6-10
-OFFSET_SIZE = 8  # [byte] of the chunk table's place, in front of the first chunk
+# The bit of withheld points in the byte of flags.
+WITHHELD_OLD = 0x80  # in point formats 0 to 5
+WITHHELD = 0x04  # in point formats 6 to 10
+OFFSET_SIZE = 8  # [byte] of the number, before the first chunk, that says where the chunk table is
 BROKEN = "the file is cut off or broken"
-MAX_LAS_SAMPLES = 1 << 20
-POINTS_A_SAMPLE = 1 << 14
-POINTS_A_LAZ_CHUNK = 50_000  # that are compressed together, usually: a sample begins where one does
+MAX_LAS_SAMPLES = 1 << 20  # points by which the range of colours is found
+POINTS_A_SAMPLE = 1 << 14  # of these, consecutive ones
+POINTS_A_LAZ_CHUNK = 50_000  # that are usually compressed together: samples begin at such chunks
 
 Records = NDArray[np.void]
 Run = tuple[int, int]  # first point, number of points
 
-logging.getLogger("laspy").addHandler(logging.NullHandler())  # else Python prints what nobody listens to
+logging.getLogger("laspy").addHandler(logging.NullHandler())  # else Python prints laspy's messages
 
 
 def open_las(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
-    """Return the points of a LAS or LAZ file; withheld ones are left out.
+    """Return the points of a LAS or LAZ file without those that are withheld.
 
-    Colours are 16-bit, as the format says, unless a million points, spread evenly over the file, tell of
-    another range. If all of these points are black, the file counts as one without colours.
+    Colours are 16-bit, as the format says, unless a million points, spread evenly over the file, have a
+    smaller range. If all of these points are black, the file counts as one without colours.
     """
     header = read_las_header(path)
     source = _open(header, options, channel)
@@ -48,12 +48,12 @@ def open_las(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "c
 
 
 def _open(header: LasHeader, options: CloudSettings, channel: Channel) -> PointSource:
-    """Return the points of a file in its unit."""
+    """Return the points of a file in the file's unit."""
     path = header.path
     field = "rgb" if channel == "colors" else "intensity"
     read = partial(_read, header, field)
     if channel == "shape":
-        next(read(), None)  # or it is refused
+        next(read(), None)  # refuses a file that can't be read
         source = reader.make_source(path, read, channel, options, header.num_points)
         return source._replace(warnings=header.warnings)
     if field == "rgb" and not header.has_colors:
@@ -71,14 +71,14 @@ def _open(header: LasHeader, options: CloudSettings, channel: Channel) -> PointS
 
 
 def _all_runs(header: LasHeader) -> Iterator[Run]:
-    """Yield runs of all points, each read at once."""
+    """Yield runs that together are all points; each is read at once."""
     most = max(1, min(POINTS_A_CHUNK, MAX_BLOCK_SIZE // header.record_size))
     for first in range(0, header.num_points, most):
         yield first, min(most, header.num_points - first)
 
 
 def _sample_runs(header: LasHeader) -> Iterator[Run]:
-    """Yield runs of about MAX_LAS_SAMPLES points, spread over the file."""
+    """Yield runs, spread over the file, of about MAX_LAS_SAMPLES points in all."""
     size = POINTS_A_LAZ_CHUNK if header.is_compressed else POINTS_A_SAMPLE
     last = (header.num_points - 1) // size
     for number in np.unique(np.linspace(0, last, max(2, MAX_LAS_SAMPLES // size)).astype(np.int64)).tolist():
@@ -86,7 +86,7 @@ def _sample_runs(header: LasHeader) -> Iterator[Run]:
 
 
 def _plain_records(header: LasHeader, runs: Iterator[Run]) -> Iterator[Records]:
-    """Yield runs of records that are not compressed."""
+    """Yield the records of runs in a file that is not compressed."""
     with header.path.open("rb") as file:
         for first, count in runs:
             file.seek(header.points_offset + first * header.record_size)
@@ -97,7 +97,7 @@ def _plain_records(header: LasHeader, runs: Iterator[Run]) -> Iterator[Records]:
 
 
 def _decompress(header: LasHeader, runs: Iterator[Run]) -> Iterator[Records]:
-    """Yield runs of records that are compressed."""
+    """Yield the records of runs in a compressed file."""
     laspy = import_optional(header.path, "laspy")
     import_optional(header.path, "lazrs")
     selected = laspy.DecompressionSelection.base()
@@ -116,9 +116,9 @@ def _decompress(header: LasHeader, runs: Iterator[Run]) -> Iterator[Records]:
 
 
 def _check_sizes(header: LasHeader) -> None:
-    """Refuse numbers that can't be, for which laspy and lazrs would read or reserve without end.
+    """Refuse impossible sizes, for which laspy and lazrs would read or allocate without end.
 
-    A writer that can't seek back writes the chunk table's place into the file's last bytes.
+    A writer that can't seek back writes the position of the chunk table into the last bytes of the file.
     """
     most = (header.points_offset - header.header_size) // VLR_HEADER.size
     if header.num_vlrs > most:
@@ -149,7 +149,7 @@ def _refusing(path: Path) -> Iterator[None]:
         yield
     except (OSError, MemoryError):
         raise
-    except BaseException as error:  # a panic in Rust: no Exception, and of a class that can't be imported
+    except BaseException as error:  # Rust panics: not an Exception, and its class can't be imported
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         why = quote_line(str(error).encode())
@@ -157,7 +157,7 @@ def _refusing(path: Path) -> Iterator[None]:
 
 
 def _read(header: LasHeader, field: str, is_sample: bool = False) -> Iterator[reader.Part]:
-    """Yield the points that are not withheld, and their colours or intensity."""
+    """Yield the points that are not withheld, in the file's unit, and their colours or intensity."""
     withheld = WITHHELD_OLD if header.point_format < 6 else WITHHELD
     runs = _sample_runs(header) if is_sample else _all_runs(header)
     for run in _decompress(header, runs) if header.is_compressed else _plain_records(header, runs):
@@ -169,11 +169,11 @@ def _read(header: LasHeader, field: str, is_sample: bool = False) -> Iterator[re
 
 
 def _points_of(records: Records, header: LasHeader) -> NDArray[np.float64]:
-    """Return the points (N, 3)."""
+    """Return the points (N, 3) in the file's unit."""
     points = np.empty((len(records), 3))
-    for k in range(3):  # by columns it is quicker
+    for k in range(3):  # column by column, which is faster
         points[:, k] = records["xyz"][:, k]
-    with np.errstate(over="ignore"):  # to infinity, and such points are dropped
+    with np.errstate(over="ignore"):  # infinite points are dropped later
         points *= header.scales
     points += header.offsets
     return points

@@ -1,4 +1,4 @@
-"""Parts of LAS and LAZ files beside the points: header, records, coordinate system and its units."""
+"""Parts of LAS and LAZ files other than the points: header, records, coordinate system and its units."""
 
 import struct
 from pathlib import Path
@@ -21,44 +21,44 @@ from ..units import (
 )
 
 MAGIC = b"LASF"
-WORTH = 0.5  # of the promised points: a file that is cut off is read if it has as many
+WORTH = 0.5  # a file that is cut off is read if it has at least this fraction of the promised points
 MIN_HEADER_SIZE = 227  # [byte]
 MIN_HEADER_SIZE_1_4 = 375  # [byte]
 COMPRESSED_BIT = 0x80  # of the point format
-# The least length of a record by point format, and where red green blue begin in those that have them [byte].
+# By point format: the least size [byte] of a record, and the first byte of red green blue, if there are any.
 RECORD_SIZES = {0: 20, 1: 28, 2: 26, 3: 34, 4: 57, 5: 63, 6: 30, 7: 36, 8: 38, 9: 59, 10: 67}
 COLORS_BYTE = {2: 20, 3: 28, 5: 28, 7: 30, 8: 30, 10: 30}
 INTENSITY_BYTE = 12
 FLAGS_BYTE = 15
 WANTED = "wanted LAS or LAZ with red green blue (point format 2, 3, 5, 7, 8 or 10)"
 MAX_VLRS = 1 << 16
-VLR_HEADER = struct.Struct("<2x16sHH32x")  # user, record id, length of what follows
+VLR_HEADER = struct.Struct("<2x16sHH32x")  # user, record id, length of the content that follows
 PROJECTION_USER = b"LASF_Projection"
 WKT_ID = 2112
 GEO_KEYS_ID = 34735
-BOX_BYTE = 179  # of the header: the greatest and the least of x, of y and of z
+BOX_BYTE = 179  # of the header: greatest and least x, then those of y and of z
 BOX = struct.Struct("<6d")
 
 
 class LasHeader(NamedTuple):
-    """The header of a LAS file."""
+    """The header of a LAS or LAZ file."""
 
     path: Path
     size: int  # [byte]
     header_size: int  # [byte]
-    points_offset: int  # [byte]
-    num_vlrs: int
+    points_offset: int  # [byte] of the first point
+    num_vlrs: int  # variable-length records
     point_format: int
     record_size: int  # [byte]
     num_points: int
-    scales: Array  # (3,) x y z
-    offsets: Array  # (3,)
+    scales: Array  # (3,) of x, y, z
+    offsets: Array  # (3,) of x, y, z, in the file's unit
     is_compressed: bool
     warnings: tuple[str, ...] = ()
 
     @property
     def dtype(self) -> np.dtype[np.void]:
-        """The fields that are read of a record."""
+        """The fields of a record that are read."""
         fields = {"xyz": ("3<i4", 0), "intensity": ("<u2", INTENSITY_BYTE), "flags": ("u1", FLAGS_BYTE)}
         if self.has_colors:
             fields["rgb"] = ("3<u2", COLORS_BYTE[self.point_format])
@@ -67,12 +67,12 @@ class LasHeader(NamedTuple):
 
     @property
     def has_colors(self) -> bool:
-        """True if the records have fields for colours, even if these are empty."""
+        """True if the records have fields for colours, even if all are black."""
         return self.point_format in COLORS_BYTE
 
 
 def read_las_header(path: Path) -> LasHeader:
-    """Return the header of a LAS or LAZ file; InputError if it is broken or promises too much."""
+    """Return the header of a LAS or LAZ file. Raise InputError if it is broken or promises too much."""
     with path.open("rb") as file:
         head = file.read(MIN_HEADER_SIZE_1_4)
     if not head.startswith(MAGIC) or len(head) < MIN_HEADER_SIZE:
@@ -112,7 +112,7 @@ def read_las_header(path: Path) -> LasHeader:
 
 
 def record_content(header: LasHeader, file: BinaryIO, wanted_user: bytes, wanted_id: int) -> bytes | None:
-    """Return the content of the variable-length record with a user and id; None if there is none."""
+    """Return the content of the variable-length record of this user and id; None if there is none."""
     position = header.header_size
     for _ in range(min(header.num_vlrs, MAX_VLRS)):
         if position + VLR_HEADER.size > header.points_offset:
@@ -134,7 +134,7 @@ def read_las_crs(path: Path) -> str:
 
 
 def _projection(header: LasHeader) -> tuple[str, bytes, bytes]:
-    """Return the records of the coordinate system: WKT, GeoTIFF keys, their doubles; empty if missing."""
+    """Return the records of the coordinate system: WKT, GeoTIFF keys, and their doubles; empty if missing."""
     with header.path.open("rb") as file:
         ids = WKT_ID, GEO_KEYS_ID, DOUBLES_ID
         wkt, keys, doubles = (record_content(header, file, PROJECTION_USER, id_) or b"" for id_ in ids)
@@ -142,7 +142,7 @@ def _projection(header: LasHeader) -> tuple[str, bytes, bytes]:
 
 
 def find_units(header: LasHeader) -> tuple[Axes, str]:
-    """Return the units of x, y, z [m] that the coordinate system names, and what is to be told of them."""
+    """Return the units of x, y, z [m] that the coordinate system names, and a note for the user, or ""."""
     wkt, keys, doubles = _projection(header)
     units = units_of_wkt(wkt) if wkt else units_of_geo_keys(keys, doubles)
     with header.path.open("rb") as file:

@@ -1,12 +1,12 @@
 """Textured and coloured meshes as point clouds: OBJ, glTF, GLB, and PLY files with faces.
 
-Coordinates are those of the file, after its own scene graph: a glTF file's y stays y, in its unit. trimesh
-reads the files.
+trimesh reads the files. Coordinates are those of the file's scene, in the file's axes and unit: the y of glTF
+stays y.
 
-Point k of N lies at the fraction (k + 1/2) / N of the cumulative area of the triangles, so that the number of
-points in a triangle is proportional to its area within one. Its position in the triangle is the k-th point of
-the R2 sequence (Roberts, 2018), which leaves no clumps and no gaps. All depends on k alone: neither on chunks
-nor on chance.
+The triangles are sampled evenly. Point k of N lies at the fraction (k + 1/2) / N of the cumulative area of
+the triangles, so that the number of points in a triangle is proportional to its area, up to one point. Its
+position in the triangle is the k-th point of the R2 sequence (Roberts, 2018), which leaves no clumps and no
+gaps. All depends on k alone, not on chunks or on chance.
 """
 
 from collections.abc import Iterator, Sequence
@@ -38,22 +38,22 @@ from .reader import (
 # 1 / p and 1 / p^2 of the plastic number p, the root of p^3 = p + 1
 R2_STEPS = (0.7548776662466927, 0.5698402909980532)
 TRIANGLES_AT_ONCE = 1 << 18  # triangles whose corners are held at once
-DENSITY = 10_000.0  # points on a square metre, 1 cm apart
+DENSITY = 10_000.0  # points per square metre, 1 cm apart
 MAX_MESH_POINTS = 30_000_000
-MAX_TRIANGLES = 200_000_000  # those of a mesh count again at each place where the scene puts it
+MAX_TRIANGLES = 200_000_000  # those of a mesh count once for each node that places it
 
 
 class Surface(NamedTuple):
     """Triangles of one material, in their own frame."""
 
-    vertices: Array  # (V, 3), NaN: the triangle is left out
-    triangles: Int64s  # (T, 3) rows of vertices
-    uv: Array | None = None  # (V, 2), v upwards from the lower edge
+    vertices: Array  # (V, 3); triangles with a NaN are left out
+    triangles: Int64s  # (T, 3) rows of `vertices`
+    uv: Array | None = None  # (V, 2) texture coordinates, v upwards from the lower edge
     texture: Texture | None = None
-    colors: Array | None = None  # (C, 3) in [0, 1]; with a texture: factors
-    corners: Int64s | None = None  # (T, 3) rows of colors
-    is_linear: bool = False  # colors are linear light, not sRGB
-    T_world_from_surface: Array = np.eye(4)  # (4, 4), with which a node places it
+    colors: Array | None = None  # (C, 3) in [0, 1]; factors of the texture if there is one
+    corners: Int64s | None = None  # (T, 3) rows of `colors`
+    is_linear: bool = False  # `colors` are linear light, not sRGB
+    T_world_from_surface: Array = np.eye(4)  # (4, 4) by which a node of the scene places it
 
     def areas(self) -> Array:
         """Return the areas (T,) of the triangles in the world; 0 for those that aren't finite."""
@@ -71,9 +71,9 @@ class Surface(NamedTuple):
 
 
 def sample_points(surfaces: Sequence[Surface], ends: Array, num_points: int) -> Iterator[RawCloud]:
-    """Yield the points of each surface, at most POINTS_A_CHUNK at once; `ends` (P,) are cumulative areas."""
+    """Yield the points on P surfaces, at most POINTS_A_CHUNK at once; `ends` (P,) are cumulative areas."""
     area_per_point = float(ends[-1]) / num_points
-    # the first point at or behind each surface's end
+    # the index of the first point at or beyond each surface's end
     behind = np.ceil(ends / area_per_point - 0.5).astype(np.int64)
     behind[-1] = num_points
     last: Texture | None = None
@@ -84,11 +84,11 @@ def sample_points(surfaces: Sequence[Surface], ends: Array, num_points: int) -> 
         if first == end:
             continue
         if surface.texture is not last:
-            texels = None  # before the next is decoded
+            texels = None  # frees it before the next is decoded
             texels = surface.texture.texels() if surface.texture else None
             last = surface.texture
         area_up_to = np.add.accumulate(surface.areas())
-        # rounding may put an area behind all ends; never a triangle of area 0
+        # rounding may put a point beyond the last triangle; the last with an area gets it
         last_row = int(np.searchsorted(area_up_to, area_up_to[-1]))
         area_before = float(ends[i - 1]) if i else 0.0
         for begin in range(first, end, POINTS_A_CHUNK):
@@ -99,7 +99,7 @@ def sample_points(surfaces: Sequence[Surface], ends: Array, num_points: int) -> 
 
 
 def compute_weights(k: Int64s) -> Array:
-    """Return barycentric coordinates (N, 3) of points k: the R2 sequence, its square folded to a triangle."""
+    """Return barycentric coordinates (N, 3) of points k (N,): the R2 sequence, folded to a triangle."""
     a, b = (np.modf(0.5 + k * step)[0] for step in R2_STEPS)
     is_beyond = a + b > 1.0
     a[is_beyond], b[is_beyond] = 1.0 - a[is_beyond], 1.0 - b[is_beyond]
@@ -107,7 +107,7 @@ def compute_weights(k: Int64s) -> Array:
 
 
 def _points(surface: Surface, k: Int64s, rows: Int64s, texels: Bytes | None) -> RawCloud:
-    """Return the points k in the triangles `rows`, without those on texels of alpha 0."""
+    """Return the points k (N,) in the triangles `rows` (N,), without those on texels of alpha 0."""
     weights = compute_weights(k)
     matrix = surface.T_world_from_surface
     triangles = surface.triangles[rows]
@@ -118,26 +118,26 @@ def _points(surface: Surface, k: Int64s, rows: Int64s, texels: Bytes | None) -> 
     if texels is None or surface.uv is None:
         gray = np.full(points_world.shape, GRAY, np.uint8)
         return RawCloud(points_world, gray if factors is None else to_bytes(factors, surface.is_linear))
-    found = look_up_texels(texels, _blend(surface.uv, triangles, weights))
-    colors = found[:, :3]
-    is_visible = found[:, 3] > 0
+    rgba = look_up_texels(texels, _blend(surface.uv, triangles, weights))
+    colors = rgba[:, :3]
+    is_visible = rgba[:, 3] > 0
     if factors is not None:
         colors = to_bytes(srgb_to_linear(colors) * factors, is_linear=True)
     return RawCloud(points_world[is_visible], np.ascontiguousarray(colors[is_visible]))
 
 
 def _blend(values: Array, corners: Int64s, weights: Array) -> Array:
-    """Interpolate values (V, D) between corners (N, 3), rows of them, by barycentric weights (N, 3)."""
+    """Interpolate values (V, D) by barycentric weights (N, 3) of their rows `corners` (N, 3)."""
     a, b, c = (values[corners[:, i]] * weights[:, i : i + 1] for i in range(3))
     return np.asarray(a + b + c)
 
 
 def look_up_texels(texels: Bytes, uv: Array) -> Bytes:
-    """Return texels (N, 4) at uv (N, 2): u to the right, v upwards from the lower edge, both repeating."""
+    """Return the texels (N, 4) at uv (N, 2): u to the right, v upwards from the lower edge, both periodic."""
     height, width = texels.shape[:2]
     turned = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
     turned -= np.floor(turned)
-    columns = np.minimum((turned[:, 0] * width).astype(np.int64), width - 1)  # 1 - 1e-17 is 1
+    columns = np.minimum((turned[:, 0] * width).astype(np.int64), width - 1)  # 1 - 1e-17 is rounded to 1
     rows = np.minimum((turned[:, 1] * height).astype(np.int64), height - 1)
     return np.asarray(texels[rows, columns])
 
@@ -146,9 +146,9 @@ def open_mesh(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "
     """Return points on the triangles of an OBJ, GLB or glTF file, 10,000 per square metre.
 
     The options' scale is the file's unit in metres. A file that would give more than 30 million points is
-    sampled at a lower density, with a warning. Colours are those of the texture (points on texels of alpha 0
-    are left out), or else of the vertices, the faces, the material. In glTF they are multiplied in linear
-    light: texture, base colour's factor, vertex colours. Textures repeat beyond their edges. Surfaces without
+    sampled at a lower density, with a warning. Colours are the texture's, or else those of the vertices, the
+    faces or the material; in glTF texture, base colour factor and vertex colours are multiplied in linear
+    light. Textures repeat beyond their edges; points on texels of alpha 0 are left out. Surfaces without
     colours are left out, with a warning.
     """
     content = path.read_bytes()
@@ -157,7 +157,7 @@ def open_mesh(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "
 
 
 def open_ply_mesh(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
-    """Return points on the faces of a PLY file, like `open_mesh`; textured if a comment names a texture."""
+    """Return points on the faces of a PLY file, as `open_mesh` does; a comment may name a texture."""
     return _source(load_ply(path), options, channel)
 
 
@@ -173,7 +173,7 @@ def _source(loaded: Loaded, options: CloudSettings, channel: Channel) -> PointSo
 
 
 def _sample(loaded: Loaded, is_bare: bool) -> PointSource:
-    """Return points on the triangles of a file."""
+    """Return points on the triangles of a file; `is_bare`: without colours."""
     path = loaded.path
     scale = loaded.settings.scale or 1.0
     surfaces, notes = _surfaces(loaded, is_bare)
@@ -205,7 +205,7 @@ def _sample(loaded: Loaded, is_bare: bool) -> PointSource:
 
 
 def _clouds(loaded: Loaded, is_bare: bool) -> list[RawCloud]:
-    """Return the points of a file that has no triangles, where the scene places them."""
+    """Return the points of a file without triangles, placed by its scene; empty if it has triangles."""
     parts = loaded.parts
     if any(hasattr(part, "faces") for part in parts.values()):
         return []
@@ -226,7 +226,7 @@ def _clouds(loaded: Loaded, is_bare: bool) -> list[RawCloud]:
 
 
 def _surfaces(loaded: Loaded, is_bare: bool) -> tuple[list[Surface], list[str]]:
-    """Return the coloured surfaces where the scene places them, and warnings; bare, all without colours."""
+    """Return the coloured surfaces, placed by the scene, and warnings; `is_bare`: all, uncoloured."""
     path = loaded.path
     meshes = {name: mesh for name, mesh in loaded.parts.items() if hasattr(mesh, "faces")}
     by_name = {name: _surface(loaded, mesh) for name, mesh in meshes.items()}
@@ -246,7 +246,7 @@ def _surfaces(loaded: Loaded, is_bare: bool) -> tuple[list[Surface], list[str]]:
         raise InputError(f"{path}: no triangles, {WANTED}")
     if not surfaces or (not is_bare and _is_one_color(surfaces)):
         raise MissingChannelError(f"{path}: no colours, {WANTED}")
-    # surfaces of one texture next to each other: it is decoded once
+    # surfaces with the same texture are put together, so that it is decoded once
     first = {id(surface.texture): i for i, surface in reversed(list(enumerate(surfaces)))}
     surfaces.sort(key=lambda surface: first[id(surface.texture)])
     return surfaces, [f"{path}: {num_bare} surfaces without colours left out"] if num_bare else []
@@ -275,7 +275,7 @@ def _surface(loaded: Loaded, mesh: Any) -> Surface | None:
     surface = Surface(vertices, triangles, is_linear=loaded.is_gltf)
     if texture is not None:
         if uv is None:
-            return surface  # the material's colour would only be multiplied
+            return surface  # no use of the material's colour, which is only a factor of the texture
         surface = surface._replace(uv=_check_uv(path, uv, vertices), texture=texture)
         if not loaded.is_gltf:
             return surface
@@ -283,7 +283,7 @@ def _surface(loaded: Loaded, mesh: Any) -> Surface | None:
 
 
 def _with_colors(surface: Surface, loaded: Loaded, mesh: Any, factor: Array | None) -> Surface:
-    """Return a surface in the colours of its vertices or faces, or else in the material's (1, 3), if any."""
+    """Return a surface with the colours of its vertices or faces, or else the material's (1, 3)."""
     triangles = surface.triangles
     of_vertices = (mesh.visual if loaded.is_gltf else mesh).vertex_attributes.get("color")
     of_faces = mesh.face_attributes.get("color")
@@ -302,7 +302,7 @@ def _with_colors(surface: Surface, loaded: Loaded, mesh: Any, factor: Array | No
 
 
 def _check_uv(path: Path, raw: Any, vertices: Array) -> Array:
-    """Return the texture coordinates (V, 2); vertices without finite ones become NaN."""
+    """Return texture coordinates (V, 2), and make the vertices without finite ones NaN, in place."""
     uv: Array = np.array(raw, dtype=np.float64)
     if uv.shape != (len(vertices), 2):
         raise InputError(f"{path}: {len(uv)} texture coordinates, wanted {len(vertices)}")
@@ -313,7 +313,7 @@ def _check_uv(path: Path, raw: Any, vertices: Array) -> Array:
 
 
 def _fractions(loaded: Loaded, raw: Any, count: int) -> Array:
-    """Return colours (N, 3) in [0, 1]; in glTF their range follows from their type."""
+    """Return colours (N, 3) in [0, 1]; in glTF their type decides their range."""
     path = loaded.path
     colors = np.array(raw)
     if colors.ndim != 2 or len(colors) != count or colors.shape[1] < 3:

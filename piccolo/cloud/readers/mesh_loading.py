@@ -1,4 +1,4 @@
-"""Meshes read by trimesh, with the files that they name, and checks of faults that it ignores silently."""
+"""Meshes read by trimesh, with the files that they name, and checks for faults that trimesh ignores."""
 
 import logging
 import re
@@ -20,33 +20,33 @@ from ..cloud_settings import BY_FILE, CloudSettings
 from .gltf import GLB_MAGIC, NO_MATERIAL, Material, prepare_gltf
 
 WANTED = "wanted a mesh with textures, vertex colours or materials"
-# faces whose indices count back from the last vertex, or are 0; trimesh would take wrong vertices
+# faces with an index that is 0 or counts back from the last vertex: trimesh would take wrong vertices
 ODD_FACE = re.compile(rb"^f(?=[ \t])[^\n]*?[ \t/](?:-|0+[ \t/\r\n])", re.MULTILINE)
-# trimesh knows a line by its very first letters and one space, and finds `usemtl` in comments too
+# trimesh wants each keyword at the very beginning of a line, and one space after it; it reads comments too
 ODD_STARTS = (
-    (re.compile(rb"\\\r?\n"), b" "),  # a line that goes on in the next
+    (re.compile(rb"\\\r?\n"), b" "),  # a line that continues on the next
     (re.compile(rb"\n[ \t]+"), b"\n"),
     (re.compile(rb"\n#[^\n]*"), b"\n"),
     (re.compile(rb"\n(v[tn]?|f|usemtl|mtllib)\t"), rb"\n\1 "),
 )
 LIBRARY_LINE = re.compile(rb"^[ \t]*mtllib[ \t]+(.*?)[ \t\r]*$", re.MULTILINE)
 TEXTURE_LINE = re.compile(r"^[ \t]*map_Kd[ \t]+(.*?)[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
-# of a map in a material library, before the name of its file
+# options of a map in a material library, before the name of its file
 MAP_OPTIONS = re.compile(r"^(?:-\w+(?:\s+(?:-?[\d.]+|on|off|[a-z]))*\s+)+", re.IGNORECASE)
 TEXTURE_COMMENT = re.compile(r"TextureFile[ \t]*(.*?)[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
-MAX_TEXELS = 1 << 28  # 16,384 x 16,384: 1 GiB while it is looked up, three while it is decoded
+MAX_TEXELS = 1 << 28  # 16,384 x 16,384: takes 1 GiB in use, and 3 GiB while it is decoded
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA", "GIF")
 MODES = frozenset({"1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr"})  # 8 bits a channel or less
 
-# Once, here: the filters are of the process, and no thread may change them.
-# NumPy before 2.3 only warned where it stopped at what is no number.
+# Filters are the process's, so they are set once, here, and not by threads.
 warnings.filterwarnings("ignore", module=r"trimesh\.")
-logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else Python prints what nobody listens to
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else Python prints trimesh's messages
+# NumPy before 2.3 only warns if it stops at a text that is not a number
 warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
 
 
 class Texture(NamedTuple):
-    """An image, still encoded: textures are decoded one at a time."""
+    """A texture as an image file in memory; textures are decoded one at a time."""
 
     path: Path  # of the mesh
     content: bytes
@@ -59,7 +59,7 @@ class Texture(NamedTuple):
 
 @contextmanager
 def own_limit() -> Iterator[None]:
-    """Lift Pillow's limit, which real textures exceed: MAX_TEXELS is held here before they are decoded."""
+    """Lift Pillow's limit of the size, which real textures exceed; `check_image` has a larger one."""
     limit = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = None
     try:
@@ -70,7 +70,7 @@ def own_limit() -> Iterator[None]:
 
 @contextmanager
 def open_image(path: Path, content: bytes, name: str = "") -> Iterator[Image.Image]:
-    """Yield an image of an allowed size; InputError if it can't be opened, or decoded by the caller."""
+    """Yield an image of an allowed size. Raise InputError if it, or the block's use of it, fails."""
     with own_limit():
         try:
             with Image.open(BytesIO(content), formats=FORMATS) as image:
@@ -78,12 +78,12 @@ def open_image(path: Path, content: bytes, name: str = "") -> Iterator[Image.Ima
                 yield image
         except (InputError, MemoryError):
             raise
-        except Exception as error:  # Pillow's decoders raise whatever their formats bring
+        except Exception as error:  # Pillow's decoders raise errors of many kinds
             raise InputError(f"{path}: the texture{name} can't be read ({first_line(error)})") from error
 
 
 def check_image(path: Path, image: Image.Image) -> None:
-    """Refuse a texture that is too large, or of more than 8 bits."""
+    """Refuse a texture that is too large, or has more than 8 bits a channel."""
     width, height = image.size
     if width * height > MAX_TEXELS:
         raise InputError(f"{path}: a texture of {width} x {height} texels, wanted at most {MAX_TEXELS}")
@@ -99,27 +99,28 @@ def first_line(error: BaseException) -> str:
 
 @dataclass
 class FileFinder:
-    """The files that a mesh names; a resolver for trimesh.
+    """A finder of the files that a mesh names, which trimesh uses as its resolver.
 
-    trimesh continues without a file that it can't get, so the last refusal is kept for later.
+    trimesh goes on without a file that it can't get, so the last error is kept, to be raised later.
     """
 
-    path: Path  # the mesh
-    is_lenient: bool = False  # a missing file costs its colours only
-    refusal: InputError | None = None
-    notes: dict[str, None] = field(default_factory=dict)  # of missing files, in order
+    path: Path  # of the mesh
+    is_lenient: bool = False  # a missing file is no error: only its colours are missing
+    refusal: InputError | None = None  # the last error
+    notes: dict[str, None] = field(default_factory=dict)  # on missing files, in order
 
     def get(self, name: str) -> bytes:
-        """Return the content of a file by the name that the mesh gives it, or else of the one beside it.
+        """Return the content of the file that a mesh names.
 
-        Of its name, capitals don't count then.
+        If there is none at the named place, a file of that name in the mesh's folder is taken, whatever its
+        capitals.
         """
         folder = self.path.parent
         name = MAP_OPTIONS.sub("", name.strip()).strip()
         last = PureWindowsPath(name).name.lower()  # names may be written on Windows
         try:
-            beside = [entry for entry in folder.iterdir() if entry.name.lower() == last]
-            files = [folder / name.replace("\\", "/"), *(beside if len(beside) == 1 else [])]
+            alike = [entry for entry in folder.iterdir() if entry.name.lower() == last]
+            files = [folder / name.replace("\\", "/"), *(alike if len(alike) == 1 else [])]
             return next(file for file in files if file.is_file()).read_bytes()
         except (OSError, ValueError, StopIteration) as error:
             why = ", which is not in its folder" if isinstance(error, StopIteration) else f" ({error})"
@@ -132,7 +133,7 @@ class FileFinder:
 
     @contextmanager
     def noting(self) -> Iterator[None]:
-        """Within this, a missing file ends the block, with a note, if that costs colours only."""
+        """Suppress the block's InputError if it is of a missing file and the finder is lenient."""
         num_notes = len(self.notes)
         try:
             yield
@@ -147,11 +148,9 @@ class Loaded:
 
     path: Path
     parts: dict[str, Any]  # meshes and points of trimesh, by name
-    nodes: list[
-        tuple[Array, str]
-    ]  # matrices (4, 4) with which the scene places parts, and these parts' names
-    materials: list[Material] | None = None  # of glTF, named by their rows
-    textures: dict[int, Texture | None] = field(default_factory=dict)  # by their images' identity
+    nodes: list[tuple[Array, str]]  # (4, 4) by which the scene places a part, and the part's name
+    materials: list[Material] | None = None  # of glTF, whose names are their indices; None for others
+    textures: dict[int, Texture | None] = field(default_factory=dict)  # by the `id` of trimesh's image
     settings: CloudSettings = BY_FILE
     notes: dict[str, None] = field(default_factory=dict)  # for the user, in order
 
@@ -161,20 +160,22 @@ class Loaded:
         return self.materials is not None
 
     def look_of(self, visual: Any) -> tuple[Texture | None, Array | None]:
-        """Return the texture and the colour (1, 3) of a surface's material, by trimesh's description."""
-        given: Any = getattr(visual, "material", None)
+        """Return the texture and the colour (1, 3) of a surface's material; `visual` is trimesh's."""
+        of_trimesh: Any = getattr(visual, "material", None)
         if self.materials is None:
-            has_color = "kd" in getattr(given, "kwargs", {})
-            color: Array | None = np.array([given.diffuse[:3]], np.float64) / 255.0 if has_color else None
-            return self._texture(getattr(given, "image", None)), color
-        material = self.materials[int(given.name)]
-        texture = self._texture(given.baseColorTexture)
+            has_color = "kd" in getattr(of_trimesh, "kwargs", {})
+            color: Array | None = None
+            if has_color:
+                color = np.array([of_trimesh.diffuse[:3]], np.float64) / 255.0
+            return self._texture(getattr(of_trimesh, "image", None)), color
+        material = self.materials[int(of_trimesh.name)]
+        texture = self._texture(of_trimesh.baseColorTexture)
         if material.texture is not None and (texture is None or visual.uv is None):
             raise InputError(f"{self.path}: a texture can't be read or its coordinates are missing, {WANTED}")
         return texture, None if material is NO_MATERIAL else np.array([material.factor])
 
     def _texture(self, image: Any) -> Texture | None:
-        """Return the texture in an image, one object for all surfaces that share it."""
+        """Return the texture of trimesh's image, the same object for all surfaces that share it."""
         if id(image) not in self.textures:
             file = getattr(image, "fp", None)  # trimesh has a placeholder for a missing image
             if file is not None:
@@ -197,7 +198,7 @@ def load_obj(path: Path, content: bytes) -> Loaded:
     try:
         content.decode()
     except UnicodeDecodeError:
-        content = content.decode("latin-1").encode()  # names in an older code
+        content = content.decode("latin-1").encode()  # names in an older encoding
     content = b"\n" + content
     for odd_start, plain in ODD_STARTS:
         content = odd_start.sub(plain, content)
@@ -216,14 +217,14 @@ def load_obj(path: Path, content: bytes) -> Loaded:
 
 
 def _check_textures(finder: FileFinder, names: list[str]) -> None:
-    """Refuse what is no image, which trimesh would ignore."""
+    """Refuse textures that are not images, which trimesh would ignore."""
     for name in sorted(set(names)):
         with finder.noting(), open_image(finder.path, finder.get(name), f" {name[:100]!a}"):
             pass
 
 
 def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
-    """Make trimesh load colours as they are, without guessing their range or clipping them."""
+    """Change what trimesh has parsed so that it keeps colours as they are: it would guess ranges and clip."""
     for mesh in (parsed, *parsed.get("geometry", {}).values()):
         if "faces" in mesh:
             mesh["process"] = False
@@ -237,11 +238,11 @@ def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
 def _load(
     finder: FileFinder, content: bytes, kind: str, has_texture: bool = True
 ) -> tuple[dict[str, Any], list[tuple[Array, str]]]:
-    """Return the parts of a file, and where its scene places them."""
+    """Return the parts of a file by name, and for each node of its scene a matrix and a part's name."""
     trimesh = import_optional(finder.path, "trimesh")
     try:
         with own_limit():
-            # vertices are split by texture coordinates only if there is a texture: colours go by vertices
+            # vertices are split by texture coordinates only if there is a texture: colours are by vertex
             options = {"fix_texture": has_texture} if kind == "ply" else {}
             load = trimesh.exchange.load.mesh_loaders[kind]
             parsed = load(BytesIO(content), resolver=finder, **options)
@@ -249,13 +250,13 @@ def _load(
             nodes = [scene.graph.get(node) for node in scene.graph.nodes_geometry]
     except (InputError, MemoryError):
         raise
-    except Exception as error:  # whatever trimesh stumbles over
+    except Exception as error:  # trimesh raises errors of many kinds
         if finder.refusal is None:
             why = f"({first_line(error)}); the file may be damaged or cut off"
             raise InputError(f"{finder.path}: trimesh can't read it {why}") from error
     if finder.refusal is not None:
         raise finder.refusal
-    # not by the nodes' names: trimesh makes some up by chance
+    # not sorted by the nodes' names, some of which trimesh makes up at random
     return scene.geometry, sorted(nodes, key=lambda node: (node[1], node[0].tobytes()))
 
 
@@ -274,7 +275,7 @@ def load_ply(path: Path) -> Loaded:
         data = elements[name].get("data")
         count = elements[name]["length"]
         columns = data.values() if isinstance(data, dict) else [data]
-        found = min((len(column) for column in columns if column is not None), default=0)
-        if found != count:
-            raise InputError(f"{path}: the header promises {count} rows of '{name}', found {found}")
+        num_rows = min((len(column) for column in columns if column is not None), default=0)
+        if num_rows != count:
+            raise InputError(f"{path}: the header promises {count} rows of '{name}', found {num_rows}")
     return loaded

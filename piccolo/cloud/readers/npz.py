@@ -1,7 +1,7 @@
-"""NumPy files: .npy with one array of points and colours, .npz with one of each.
+"""NumPy files: .npy with one array of points and colours, .npz with an array of points and one of colours.
 
-Nothing is unpickled. A .npy file is read in chunks; an .npz file, and an array in Fortran order (column after
-column), is read whole, after the size in its header has been compared with the file's.
+Nothing is unpickled. A .npy file is read in chunks. An .npz file, and an array in Fortran order (column after
+column), is read whole, after the size that its header promises has been compared with the file's.
 """
 
 import errno
@@ -25,8 +25,8 @@ from .text_columns import MAX_COLUMNS, drop_broken, name_columns, names_of_user,
 NPY_MAGIC = b"\x93NUMPY"
 ZIP_MAGIC = b"PK\x03\x04"
 ZIP_NAME_AT = 30  # [byte] in an archive: the name of its first member
-NUM_SAMPLED_ROWS = 10_000  # rows by whose values columns are named
-MAX_ZIP_RATIO = 200  # unpacked to packed; real scans stay below 10, deflate could reach 1032
+NUM_SAMPLED_ROWS = 10_000  # rows whose values tell what the columns are
+MAX_ZIP_RATIO = 200  # unpacked to packed size; real scans stay below 10, deflate could reach 1032
 MAX_UNPACKED = 1 << 34  # [byte] of an archive's arrays, which are read whole
 POINTS_NAMES = ("points", "xyz")
 COLORS_NAMES = ("colors", "rgb")
@@ -37,9 +37,9 @@ class ArrayInFile(NamedTuple):
     """An array in a .npy file or in a member of an archive, not yet read."""
 
     path: Path
-    member: str | None
+    member: str | None  # name in an archive; None in a .npy file
     shape: tuple[int, ...]
-    is_fortran: bool  # column after column
+    is_fortran: bool  # stored column after column
     dtype: np.dtype[Any]
     offset: int  # [byte] of the first number
 
@@ -53,7 +53,7 @@ class ArrayInFile(NamedTuple):
             yield from reader.read_records(self.path, self.offset, self.shape[0], row)
             return
         with naming_damage(self.path), _open(self.path, self.member) as file:
-            file.read(self.offset)  # not seek, so that the checksum covers all
+            file.read(self.offset)  # read, not seek, so that the checksum covers all bytes
             content = file.read(math.prod(self.shape) * self.dtype.itemsize)
             order: Literal["F", "C"] = "F" if self.is_fortran else "C"
             array = np.frombuffer(content, self.dtype).reshape(self.shape, order=order)
@@ -62,7 +62,7 @@ class ArrayInFile(NamedTuple):
 
 
 def open_npy(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
-    """Return the points of a .npy file: an array (N, 6) of x y z r g b, or others as in a text file."""
+    """Return the points of a .npy file: an array (N, 6) of x y z r g b, or columns as in text files."""
     array = _open_array(path, None, path.stat().st_size)
     num_columns = array.shape[-1] if len(array.shape) == 2 else 0
     if not 3 <= num_columns <= MAX_COLUMNS or array.dtype.kind not in "fiu":
@@ -81,7 +81,7 @@ def open_npy(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "c
     def read_columns() -> Iterator[reader.Columns]:
         return (list(rows[:, columns].T) for rows in array.read_rows())
 
-    # as in text, where no type is declared
+    # the types that text files get, which declare none
     types = ["i8" if len(chosen) == reader.NUM_COLORED else "u4"] * len(chosen)
     source = reader.Table(path, read_columns, chosen, types, array.shape[0]).source(channel, options)
     return source._replace(warnings=(*filter(None, [note]), *source.warnings))
@@ -90,7 +90,7 @@ def open_npy(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "c
 def open_npz(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
     """Return the points of a .npz file: the arrays `points` (or `xyz`) and `colors` (or `rgb`), both (N, 3).
 
-    An archive whose arrays promise more than 200 times the size of the file, or 16 GB, is refused.
+    An archive whose arrays promise more than 200 times the size of the file, or more than 16 GB, is refused.
     """
     if channel == "intensity":
         raise MissingChannelError(f"{path}: has no intensity")
@@ -110,7 +110,7 @@ def open_npz(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "c
 
 
 def has_npz_magic(head: bytes) -> bool:
-    """Return True if a file that begins with the bytes `head` is an archive that begins with an array."""
+    """Return True if `head` begins as an archive does whose first member is an array."""
     name_size = int.from_bytes(head[ZIP_NAME_AT - 4 : ZIP_NAME_AT - 2], "little")
     return head.startswith(ZIP_MAGIC) and head[ZIP_NAME_AT : ZIP_NAME_AT + name_size].endswith(b".npy")
 
@@ -124,7 +124,7 @@ def naming_damage(path: Path, wanted: str = WANTED) -> Iterator[None]:
         raise
     except Exception as error:
         if isinstance(error, OSError) and error.errno != errno.EINVAL:
-            raise  # the disk's or the user's trouble; EINVAL is zipfile going to a place before the beginning
+            raise  # not damage of the file; EINVAL is: zipfile then seeks before the beginning
         raise InputError(f"{path}: damaged ({quote_line(str(error).encode())}), {wanted}") from error
 
 
@@ -133,11 +133,11 @@ def _open(path: Path, member: str | None) -> IO[bytes]:
     if member is None:
         return path.open("rb")
     with zipfile.ZipFile(path) as archive:
-        return archive.open(member)  # it outlives the archive
+        return archive.open(member)  # can be read after the archive is closed
 
 
 def _members(path: Path, is_bare: bool) -> list[zipfile.ZipInfo]:
-    """Return an archive's arrays of points and of colours; of points alone if only the shape counts."""
+    """Return an archive's members with points and with colours; with points alone if `is_bare`."""
     with naming_damage(path), zipfile.ZipFile(path) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
     kinds = (POINTS_NAMES,) if is_bare else (POINTS_NAMES, COLORS_NAMES)
@@ -159,7 +159,7 @@ def _members(path: Path, is_bare: bool) -> list[zipfile.ZipInfo]:
 
 
 def _open_array(path: Path, member: str | None, size: int) -> ArrayInFile:
-    """Return the array in a file or member of `size` bytes, by its header."""
+    """Return the array in a file or member of `size` bytes; only its header is read."""
     with naming_damage(path), _open(path, member) as file:
         shape, is_fortran, dtype, offset = read_array_header(file.read(MAX_HEAD_SIZE))
     array = ArrayInFile(path, member, shape, is_fortran, dtype, offset)

@@ -1,6 +1,6 @@
 """PCD files of the Point Cloud Library, 0.5 to 0.7: ascii, binary and binary_compressed.
 
-VIEWPOINT is the sensor's pose; the points are already in the cloud's frame, so it is not applied.
+VIEWPOINT, the sensor's pose, is not applied: the points are already in the cloud's frame.
 """
 
 import re
@@ -18,11 +18,11 @@ from . import reader
 from .reader import MissingChannelError, PointSource, quote_line
 from .text import LineLayout, NumberLines
 
-MAX_PCD_HEADER_SIZE = MAX_PCD_ROW = 1 << 16  # [byte]; a row is a point
+MAX_PCD_HEADER_SIZE = MAX_PCD_ROW = 1 << 16  # [byte] a row is one point
 MAX_PCD_COUNT_DIGITS = 10
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 WANTED = "wanted a PCD file with the fields x y z and rgb, rgba or r g b"
-MAX_LZF_RATIO = 88  # of LZF, in which three bytes can stand for a copy of 264
+MAX_LZF_RATIO = 88  # of LZF: three bytes can stand for 264
 FIRST_LINES = re.compile(rb"(?:#[^\n]*\n|[ \t\r\n])*(?:# \.PCD|VERSION[ \t]+0?\.\d)")
 PADDING = "_"
 BROKEN = "the file is cut off or broken"
@@ -34,13 +34,13 @@ class PcdField:
 
     name: str
     type: str  # NumPy's, without byte order: all numbers are little-endian
-    count: int  # numbers
-    offset: int  # [byte] in a point
-    column: int  # of its first number among those of a point
+    count: int  # of numbers in the field
+    offset: int  # [byte] of the field in a point
+    column: int  # index of its first number among the numbers of a point
 
     @property
     def size(self) -> int:
-        """Bytes of all its numbers."""
+        """Size of all its numbers [byte]."""
         return int(self.type[1:]) * self.count
 
 
@@ -51,16 +51,16 @@ class PcdHeader(NamedTuple):
     fields: tuple[PcdField, ...]
     num_points: int
     encoding: str  # one of ENCODINGS
-    size: int  # [byte], the data begin here
+    size: int  # [byte] of the header: the data begin there
 
     @property
     def row_size(self) -> int:
-        """Bytes of a point in binary."""
+        """Size of a point in binary files [byte]."""
         return sum(field.size for field in self.fields)
 
 
 def read_pcd_header(path: Path) -> PcdHeader:
-    """Return the header of a PCD file; SIZE, TYPE and COUNT, if missing as in old files, are 4, F and 1."""
+    """Return the header of a PCD file; SIZE, TYPE and COUNT are 4, F and 1 if missing, as in old files."""
     with path.open("rb") as file:
         head = file.read(MAX_PCD_HEADER_SIZE)
     entries: dict[str, list[str]] = {}
@@ -105,7 +105,7 @@ def _fields(path: Path, entries: dict[str, list[str]]) -> tuple[PcdField, ...]:
 
 
 def _num_points(path: Path, entries: dict[str, list[str]]) -> int:
-    """Return POINTS, or WIDTH x HEIGHT; InputError if both are there and differ."""
+    """Return POINTS, or WIDTH x HEIGHT. Raise InputError if both are given and differ."""
     found = {key: entries[key] for key in ("WIDTH", "HEIGHT", "POINTS") if key in entries}
     counts = {key: _count(" ".join(words)) for key, words in found.items()}
     if None in counts.values() or not counts.keys() & {"POINTS", "WIDTH"}:
@@ -125,16 +125,16 @@ def _count(text: str) -> int | None:
 def open_pcd(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
     """Return the points of a PCD file.
 
-    Colours are `rgb` or `rgba`, three bytes in one integer or, if the field is declared a float, in its bits,
-    in ASCII too; or r g b (red green blue). Alpha and all other fields are left out, but for `intensity` or
-    `label` where one is asked for. The size of a binary file is compared with the header before memory is
-    reserved.
+    Colours are fields r g b (red green blue), or one field `rgb` or `rgba`: three bytes in an integer or, if
+    the field is declared a float, in the float's bits, also in ASCII files. Alpha and other fields are left
+    out, unless the channel is the intensity. The size of a binary file is compared with the header before
+    memory is allocated.
     """
     header = read_pcd_header(path)
     fields = _select_fields(header, options, channel)
     found = path.stat().st_size - header.size
     promised = {"ascii": 0, "binary": header.row_size * header.num_points}.get(header.encoding, 8)
-    if promised > found:  # of ASCII and compressed data this is known when they are read
+    if promised > found:  # for ASCII and compressed data more is known only when they are read
         counts = f"{header.num_points} points in {promised} bytes or more, found {found} bytes"
         raise InputError(f"{path}: the header promises {counts}; {BROKEN}")
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}
@@ -145,7 +145,7 @@ def open_pcd(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "c
 
 
 def _select_fields(header: PcdHeader, options: CloudSettings, channel: Channel) -> tuple[PcdField, ...]:
-    """Return the fields x y z and one or three of colours, or the intensity, or no others."""
+    """Return the fields x y z and those of the channel: one or three of colours, the intensity, or none."""
     names = [field.name for field in header.fields]
     found = {field.name: field for field in header.fields if field.count == names.count(field.name) == 1}
     chosen = reader.find_fields(found, channel)
@@ -176,7 +176,7 @@ def _read_binary(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[re
 
 
 def _read_compressed(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[reader.Columns]:
-    kept = [field for field in header.fields if field.name != PADDING]  # PCL leaves padding out
+    kept = [field for field in header.fields if field.name != PADDING]  # PCL does not write padding here
     promised = header.num_points * sum(field.size for field in kept)
     found = header.path.stat().st_size - header.size - 8
     lzf = import_optional(header.path, "lzf")
@@ -191,9 +191,9 @@ def _read_compressed(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterato
         table = lzf.decompress(packed, size)
     except ValueError:
         table = None
-    if table is None or len(table) != size:  # of data that make more, and fewer
+    if table is None or len(table) != size:  # None if there are more bytes than promised
         raise InputError(f"{header.path}: the compressed data are broken, {WANTED}")
-    # all points' values of a field, then those of the next
+    # the values of all points for one field follow each other, then those for the next
     ends = np.cumsum([field.size * header.num_points for field in kept])
     parts = dict(zip(kept, np.split(np.frombuffer(table, np.uint8), ends[:-1]), strict=True))
     yield from reader.in_chunks([parts[field].view("<" + field.type) for field in fields])

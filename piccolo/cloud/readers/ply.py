@@ -1,7 +1,7 @@
 """PLY files: the vertices' positions and colours.
 
-plyfile reads the header: the names, types and byte order. It would reserve any size that the header
-promises, and read ASCII and lists line by line in Python, so the numbers are read here.
+plyfile reads the header: the names, types and byte order. The numbers are read here, as plyfile would
+allocate any size that the header promises, and read ASCII and lists line by line in Python.
 """
 
 import re
@@ -31,7 +31,7 @@ WANTED = "wanted a PLY file whose vertices have x y z and red green blue"
 MAX_PLY_COUNT_DIGITS = 15
 MAX_VERTEX_SIZE = 1 << 24  # [byte] of a vertex with its lists
 OPACITY = "opacity"
-MOST_STRAY = 20  # vertices to a face in a cloud that is no mesh
+MOST_STRAY = 20  # a file with more vertices per face is a cloud with a few stray faces, not a mesh
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,15 @@ class PlyHeader:
 
     path: Path
     elements: tuple[PlyElement, ...]
-    counts: tuple[int, ...]  # of each element
+    counts: tuple[int, ...]  # number of rows of each element
     byte_order: str  # '<' or '>', '=' in ASCII
     is_ascii: bool
-    size: int  # [byte], the data begin here
-    index: int  # of the element of the vertices
+    size: int  # [byte] of the header: the data begin there
+    index: int  # of the vertices among the elements
 
     @property
     def pairs(self) -> list[tuple[PlyElement, int]]:
-        """The elements with their counts."""
+        """The elements with their numbers of rows."""
         return list(zip(self.elements, self.counts, strict=True))
 
     @property
@@ -58,14 +58,14 @@ class PlyHeader:
 
 
 def open_ply(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
-    """Return the vertices of a PLY file, binary or ASCII; points on its faces if it has any.
+    """Return the vertices of a PLY file, binary or ASCII; if it is a mesh, points on its faces.
 
     Other properties and elements are left out. The file's size is compared with the header's counts before
-    memory is reserved.
+    memory is allocated.
     """
     header = read_ply_header(path)
     num_faces = sum(count for element, count in header.pairs if element.name == "face")
-    if num_faces * MOST_STRAY > header.counts[header.index]:  # no cloud with a few stray faces
+    if num_faces * MOST_STRAY > header.counts[header.index]:  # a mesh
         return open_ply_mesh(path, options, channel)
     names = _property_names(header, options, channel)
     if not header.is_ascii and not _lists_before(header):
@@ -78,7 +78,7 @@ def open_ply(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "c
 
 
 def read_columns(header: PlyHeader, names: Sequence[str]) -> Iterator[reader.Columns]:
-    """Yield the named columns of up to POINTS_A_CHUNK vertices; those of an ASCII file are float64."""
+    """Yield the named columns of up to POINTS_A_CHUNK vertices at once; those of ASCII are float64."""
     if not header.is_ascii:
         if _lists_before(header):
             yield from _read_among_lists(header, names)
@@ -96,7 +96,7 @@ def read_columns(header: PlyHeader, names: Sequence[str]) -> Iterator[reader.Col
 
 
 def read_ply_header(path: Path) -> PlyHeader:
-    """Return the header of a PLY file; InputError if it is broken."""
+    """Return the header of a PLY file. Raise InputError if it is broken."""
     with path.open("rb") as file:
         head = file.read(MAX_PLY_HEADER_SIZE)
     if not head.startswith(MAGIC):
@@ -112,7 +112,7 @@ def read_ply_header(path: Path) -> PlyHeader:
     if not all(count.isdigit() and len(count) <= MAX_PLY_COUNT_DIGITS for count in counts):
         raise InputError(f"{path}: the header counts {quote_line(b' '.join(counts))} elements, {WANTED}")
     try:
-        # counts of 0 let plyfile stop at the header's end
+        # with counts of 0, plyfile stops at the end of the header
         ply = PlyData.read(BytesIO(ELEMENT_LINE.sub(rb"\g<1>0", text)), mmap=False)
     except (PlyParseError, ValueError) as error:
         raise InputError(f"{path}: broken header ({quote_line(str(error).encode())}), {WANTED}") from error
@@ -126,9 +126,9 @@ def read_ply_header(path: Path) -> PlyHeader:
 
 
 def _property_names(header: PlyHeader, options: CloudSettings, channel: Channel) -> tuple[str, ...]:
-    """Return the vertices' properties for x, y, z and red, green, blue, or intensity, or none."""
+    """Return the names of the vertices' properties that hold x, y, z and the channel."""
     properties = header.vertices.properties
-    if header.is_ascii:  # of a line with lists only what is before them has its place
+    if header.is_ascii:  # in a line with lists only the numbers before these have a fixed column
         properties = tuple(takewhile(lambda prop: not _is_list(prop), properties))
     found = [prop.name for prop in properties if not _is_list(prop)]
     names = reader.find_fields(found, channel)
@@ -141,7 +141,7 @@ def _property_names(header: PlyHeader, options: CloudSettings, channel: Channel)
 
 
 def place_of_vertices(header: PlyHeader) -> tuple[int, int, np.dtype[np.void]]:
-    """Return the start [byte] of a binary file's vertices, their number and their dtype."""
+    """Return the first byte of a binary file's vertices, their number and their dtype."""
     count = header.counts[header.index]
     before = zip(header.elements[: header.index], header.counts, strict=False)
     offset = header.size + sum(count * element.dtype().itemsize for element, count in before)
@@ -158,7 +158,7 @@ def _is_list(prop: object) -> bool:
 
 
 def _lists_before(header: PlyHeader) -> bool:
-    """Return True if the vertices, or elements before them, have lists, so that rows differ in length."""
+    """Return True if the vertices, or elements before them, have lists: their rows differ in length."""
     return any(_is_list(prop) for some in header.elements[: header.index + 1] for prop in some.properties)
 
 

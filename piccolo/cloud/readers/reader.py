@@ -1,9 +1,9 @@
-"""Parts of all readers: chunks of points as in a file, and points from columns of numbers.
+"""Parts that all readers use: chunks of points as in the file, and points from columns of numbers.
 
 Columns are arrays (N,) of x, y, z and red, green, blue, or of x, y, z and a scalar. Colours of any type
-become 8 bits; `find_brightest` has the one rule for their range. Intensity becomes a gray. Its unit differs
-from scanner to scanner, and a few mirrors outshine everything: the 1st percentile of a file becomes black,
-its 99th white. These are percentiles of all points, in any order, for which the file is read once more.
+become 8 bits; `find_brightest` is the only rule for their range. Intensity becomes a grey. Its unit differs
+from scanner to scanner, and a few mirrors outshine everything: so the 1st percentile of a file becomes black,
+its 99th white. To find these percentiles of all points, the file is read once more.
 """
 
 import functools
@@ -20,23 +20,23 @@ from ...system.arrays import Array, Bytes, Floats, Mask
 from ...system.errors import InputError
 from ..cloud_settings import BY_FILE, RANGES, Channel, CloudSettings, UpAxis
 
-HEAD_SIZE = 512  # [byte] from which a format is known
-POINTS_A_CHUNK = 1 << 17  # points of a chunk, at most: they stay in the processor's cache
-MAX_BLOCK_SIZE = 1 << 28  # [byte] read at once, in which POINTS_A_CHUNK records of 256 bytes have room
+HEAD_SIZE = 512  # [byte] of a file, by which its format is known
+POINTS_A_CHUNK = 1 << 17  # points of a chunk, at most: so many stay in the processor's cache
+MAX_BLOCK_SIZE = 1 << 28  # [byte] read at once, at most: POINTS_A_CHUNK records of 2 kB
 MAX_CRS_LENGTH = 20_000  # characters of a coordinate system's description
 CUT = "the file was cut while it was read, wanted a whole file"
 
-# Points (N, 3) in the file's unit, float32 if stored as such; and colours (N, 3), or a number (N,) of each.
+# Points (N, 3) in the file's unit, float32 if stored as such; and their colours (N, 3), or a scalar (N,).
 Part = tuple[NDArray[np.floating[Any]], NDArray[Any]]
-PartReader = Callable[[], Iterator[Part]]  # each call from the start
-# The usual value of full brightness, by the type of a field without its byte order; of others 255.
+PartReader = Callable[[], Iterator[Part]]  # each call begins at the start of the file
+# The usual value of full brightness by the type of a field, without its byte order; for other types 255.
 USUAL = {"u2": 65535.0, "f2": 1.0, "f4": 1.0, "f8": 1.0}
 BYTE_RANGE = 255.0
-EXCESS = 1.001  # of full brightness, up to which a value is rounded to it
-STRAY = 4.0  # times full brightness is a wrong colour, which is refused, not one of a wider range
+EXCESS = 1.001  # times full brightness: values up to this are rounded to full brightness
+STRAY = 4.0  # times full brightness: values up to this are wrong colours, not signs of a wider range
 PACKED_NAMES = ("rgb", "rgba", "color")  # 0xAARRGGBB in one number
-SPLAT_NAMES = ("f_dc_0", "f_dc_1", "f_dc_2")  # of Gaussian splats
-FRACTION_NAMES = ("rf", "gf", "bf")  # CloudCompare's for colours 0-1
+SPLAT_NAMES = ("f_dc_0", "f_dc_1", "f_dc_2")  # colours of Gaussian splats
+FRACTION_NAMES = ("rf", "gf", "bf")  # CloudCompare's, for colours from 0 to 1
 COLOR_NAMES = (
     ("red", "green", "blue"),
     ("r", "g", "b"),
@@ -49,27 +49,28 @@ COLOR_NAMES = (
 POINT_NAMES = (("x", "y", "z"), *(("easting", "northing", up) for up in ("elevation", "height", "z")))
 Columns = Sequence[NDArray[Any]]
 INTENSITY_NAMES = ("intensity", "scalar_intensity", "reflectance", "scalar_reflectance")
-DARK_SHARE = 0.01  # fraction of the points that are darker than the level that is dark
-BRIGHT_SHARE = 0.99  # and than the one that is bright
+DARK_SHARE = 0.01  # fraction of the points that are darker than the intensity that becomes black
+BRIGHT_SHARE = 0.99  # and than the one that becomes white
 LARGEST = float(np.finfo(np.float32).max)
 NUM_LEVEL_BINS = 1 << 16
 NUM_COLORED = 6  # columns x y z red green blue
-SPLAT_FACTOR = 0.28209479177387814  # of the constant spherical harmonic, 1 / (2 sqrt(pi))
-GRAY = 128  # of points of which only the shape counts
+SPLAT_FACTOR = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
+GRAY = 128  # level of points of which only the shape is used
 
 
 class MissingChannelError(InputError):
-    """A file that is sound, but has no colours, or no intensity."""
+    """A file is sound but lacks the channel: it has no colours, or no intensity."""
 
 
 class RawCloud(NamedTuple):
     """Points in the file's order and unit, not yet checked."""
 
-    points_world: Floats  # (N, 3) in the file's unit, maybe NaN; float32 if stored as such
+    points_world: Floats  # (N, 3) in the file's unit, NaN if invalid; float32 if stored as such
     colors: Bytes  # (N, 3) RGB
 
 
-ChunkReader = Callable[[], Iterator[RawCloud]]  # each call from the start; InputError where the data break
+# each call begins at the start of the file; InputError is raised where the data are broken
+ChunkReader = Callable[[], Iterator[RawCloud]]
 
 
 class PointSource(NamedTuple):
@@ -77,13 +78,13 @@ class PointSource(NamedTuple):
 
     path: Path
     read_chunks: ChunkReader
-    num_points: int | None = None  # for the progress; None if only reading can tell
-    warnings: tuple[str, ...] = ()  # one line each, for the user: what was decided about this file
-    station_axes: tuple[Array, ...] = ()  # (3,) unit, z of scanners with poses, file's axes
+    num_points: int | None = None  # to show progress; None if it is known only after reading
+    warnings: tuple[str, ...] = ()  # one line each: how the file is read, where that was to be decided
+    station_axes: tuple[Array, ...] = ()  # (3,) unit, z axes of scanners with poses, in the file's axes
     up: UpAxis = "z"  # the axis that points up by the format's specification or by convention
-    channel: Channel = "colors"  # what is read of the points
-    units: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of x, y, z [m]
-    unit_note: str = ""  # what was decided about them, if it is to be told
+    channel: Channel = "colors"  # what is read beside x y z
+    units: tuple[float, float, float] = (1.0, 1.0, 1.0)  # [m] of x, y, z
+    unit_note: str = ""  # a line for the user on the units, unless they are metres as usual
 
 
 def quote_line(line: bytes) -> str:
@@ -93,14 +94,14 @@ def quote_line(line: bytes) -> str:
 
 
 def point_label(path: Path, index: int) -> str:
-    """Return the name of a file's point in messages."""
+    """Return the name of a point of a file for messages."""
     return f"{path}: point {index + 1}"
 
 
 def find_fields(names: Collection[str], channel: Channel) -> tuple[str, ...]:
-    """Return x y z and the colours or intensity among a file's names; empty if any is missing.
+    """Return, of the names of a file's fields, those of x y z and the channel; empty if one is missing.
 
-    Capitals don't count.
+    Upper and lower case are the same.
     """
     by_lower = {name.lower(): name for name in reversed([*names])}
     wanted: dict[Channel, Sequence[tuple[str, ...]]] = {
@@ -120,21 +121,21 @@ def find_brightest(
 ) -> tuple[float, tuple[str, ...]]:
     """Return the value of full brightness of colours, and a warning if it is not the usual one.
 
-    It is the one of the settings, or else the least of 1, 255 and 65535 that no value exceeds by far. Parts
-    are looked at until one decides: for 16 bits by a value above 255, else by one above 1 or by a fraction.
+    It is that of the settings, or else the least of 1, 255 and 65535 that no value exceeds by far. Parts are
+    read only until one decides: if 65535 is usual by a value above 255, else by one above 1 or a fraction.
     """
     if settings.color_range is not None:
         return settings.color_range, ()
     largest = 0.0
     has_fractions = False
     for points, values in parts:
-        seen = values[np.isfinite(points).all(axis=1)]
-        largest = max(largest, float(np.nanmax(seen, initial=0.0)))
-        has_fractions = has_fractions or bool(seen.dtype.kind == "f" and (seen % 1.0 > 0.0).any())
+        of_valid = values[np.isfinite(points).all(axis=1)]
+        largest = max(largest, float(np.nanmax(of_valid, initial=0.0)))
+        has_fractions = has_fractions or bool(of_valid.dtype.kind == "f" and (of_valid % 1.0 > 0.0).any())
         if largest > BYTE_RANGE or (usual != RANGES[-1] and (largest > 1.0 or has_fractions)):
             break
-    most = [STRAY if has_fractions else EXCESS, STRAY * BYTE_RANGE, np.inf]
-    brightest = next(limit for limit, most_of_it in zip(RANGES, most, strict=True) if largest <= most_of_it)
+    limits = [STRAY if has_fractions else EXCESS, STRAY * BYTE_RANGE, np.inf]
+    brightest = next(full for full, limit in zip(RANGES, limits, strict=True) if largest <= limit)
     if brightest == usual or largest == 0.0:
         return usual, ()
     found = f"colours are read as 0 to {brightest:g} instead of 0 to {usual:g} (largest value {largest:g})"
@@ -142,15 +143,15 @@ def find_brightest(
 
 
 def color_chunks(parts: Iterable[Part], brightest: float, locate: Callable[[int], str]) -> Iterator[RawCloud]:
-    """Yield points with their colours (N, 3), of any type from 0 to `brightest`, as 8 bits.
+    """Yield points with their colours (N, 3), given in any type from 0 to `brightest`, in 8 bits.
 
-    Raises InputError if a colour is out of range: `locate` turns a point's index into the file and a place.
+    Raise InputError if a colour is out of range; `locate` turns the index of its point into words.
     """
     num_before = 0
     for points_world, values in parts:
         if values.dtype == np.uint8 and brightest == BYTE_RANGE:
             colors = np.array(values, dtype=np.uint8)
-        else:  # a point without a finite position needs no colour: it becomes black
+        else:  # a point without a finite position, which is dropped later, may have any colour
             is_finite: Mask = np.all(np.isfinite(points_world), axis=1)
             numbers = np.where(is_finite[:, None], values, 0).astype(np.float64) * (BYTE_RANGE / brightest)
             least = BYTE_RANGE * (1.0 - EXCESS)
@@ -177,7 +178,7 @@ def read_records(path: Path, offset: int, count: int, dtype: np.dtype[Any]) -> I
 
 
 def take_records(file: BufferedReader, path: Path, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return the next `count` records of a file; InputError if there are fewer."""
+    """Return the next `count` records of a file. Raise InputError if there are fewer."""
     records = np.empty(count, dtype)
     if file.readinto(records.view(np.uint8).data) < records.nbytes:
         raise InputError(f"{path}: {CUT}")
@@ -192,7 +193,7 @@ def in_chunks(columns: Columns) -> Iterator[Columns]:
 
 def points_of(columns: Columns) -> NDArray[np.floating[Any]]:
     """Return the points (N, 3) in the first three columns: float32 if stored as such, else float64."""
-    with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
+    with np.errstate(invalid="ignore"):  # a signalling NaN
         points = np.stack(columns[:3], axis=1)
         return points.astype(np.float32 if points.dtype == np.float32 else np.float64, copy=False)
 
@@ -205,7 +206,7 @@ def color_source(
     samples: Iterable[Part] | None = None,
     locate: Callable[[int], str] | None = None,
 ) -> PointSource:
-    """Return points with colours from 0 to a usual value, or to what the samples, else all points, tell."""
+    """Return points with colours whose range is found by `find_brightest`, from samples or all points."""
     brightest, notes = find_brightest(path, read() if samples is None else samples, settings, usual)
     place = locate or partial(point_label, path)
     return PointSource(path, lambda: color_chunks(read(), brightest, place), warnings=notes)
@@ -219,9 +220,9 @@ def make_source(
     num_points: int | None = None,
     types: Sequence[str] = (),
 ) -> PointSource:
-    """Return the points that `read` yields with colours, else an intensity.
+    """Return the points that `read` yields with the channel: colours, intensity, or one grey for all.
 
-    Colours are bytes, unless they are of other `types`. If only the shape counts, the points are grey.
+    Colours are bytes unless `types` names other types, whose range is then found.
     """
     if types and channel == "colors":
         usual = USUAL.get(types[0], BYTE_RANGE) if len({*types}) == 1 else BYTE_RANGE
@@ -237,16 +238,16 @@ def make_source(
 
 
 class Table(NamedTuple):
-    """Columns of numbers in a file: x y z, and those of a channel."""
+    """Columns of numbers in a file: x y z and those of the channel."""
 
     path: Path
-    read_columns: Callable[[], Iterator[Columns]]  # each call from the start
+    read_columns: Callable[[], Iterator[Columns]]  # each call begins at the start of the file
     names: Sequence[str]
-    types: Sequence[str]  # as declared, without byte order
+    types: Sequence[str]  # as the file declares, without byte order
     num_points: int | None = None
 
     def source(self, channel: Channel, settings: CloudSettings) -> PointSource:
-        """Return the points with colours, packed or not, or of splats; or with a scalar; or alone."""
+        """Return the points with the channel; colours may be packed into one number, or those of splats."""
         colors = tuple(name.lower() for name in self.names[3:6])
         types = self.types[3:]
         read = self._read_parts
@@ -278,7 +279,7 @@ class Table(NamedTuple):
             yield points_of([column[is_opaque] for column in columns[:3]]), colors
 
     def _read_packed(self) -> Iterator[Part]:
-        """Yield colours 0xAARRGGBB, in numbers of a declared type, which ASCII has as text."""
+        """Yield points with colours 0xAARRGGBB in numbers of the declared type, in binary or as text."""
         num_before = 0
         for columns in self.read_columns():
             points = points_of(columns)
@@ -299,8 +300,8 @@ class Table(NamedTuple):
 def _find_bits(values: NDArray[Any], type_: str, is_text: bool) -> tuple[NDArray[np.uint32], Mask]:
     """Return the 32 bits (N,) of each number, and a mask (N,) of the numbers that have 32 bits.
 
-    A whole number is meant as such though the field is declared a float, as scripts write it: in the bits of
-    that float alpha would be neither 0 nor 255.
+    A whole number is taken as the bits even in a field that is declared a float, as some scripts write it: in
+    the bits of such a float alpha would be neither 0 nor 255.
     """
     with np.errstate(invalid="ignore"):
         is_whole = (values >= 1 if type_ == "f4" else values >= -(2.0**31)) & (values < 2.0**32)
@@ -308,7 +309,7 @@ def _find_bits(values: NDArray[Any], type_: str, is_text: bool) -> tuple[NDArray
     whole = np.where(is_whole, values, 0).astype(np.int64).astype(np.uint32)
     if type_ != "f4":
         return whole, is_whole
-    # alpha 255 and a red above 127 make a NaN, which in text has lost its bits
+    # alpha 255 and red above 127 make a NaN, whose bits are lost in text
     is_right = (np.abs(values) <= LARGEST) if is_text else np.ones(len(values), np.bool_)
     floats = (
         np.where(is_right, values, 0).astype(np.float32) if is_text else np.ascontiguousarray(values, "=f4")
@@ -317,9 +318,9 @@ def _find_bits(values: NDArray[Any], type_: str, is_text: bool) -> tuple[NDArray
 
 
 def as_gray(intensity: Array, low: float, high: float) -> Bytes:
-    """Convert intensity (N,) to gray (N, 3): black up to `low` and for NaN, white from `high` on.
+    """Convert intensity (N,) to grey (N, 3): black up to `low` and for NaN, white from `high` on.
 
-    If all are alike, they say no more than no intensity does.
+    If `low` is not below `high`, all are the same grey as without an intensity.
     """
     if not low < high:
         return np.full((len(intensity), 3), GRAY, np.uint8)
@@ -329,21 +330,19 @@ def as_gray(intensity: Array, low: float, high: float) -> Bytes:
 
 
 def _limits(chunks: Iterator[Part]) -> tuple[float, float]:
-    """Return percentiles of the intensity of points with a position, within 1 %, or exact up to 255."""
+    """Return 1st and 99th percentile of the intensity of valid points, within 1 % or exact up to 255."""
     histogram = np.zeros(NUM_LEVEL_BINS, np.int64)  # by the upper half of a float32's bits
     for points, intensity in chunks:
         is_measured = np.isfinite(points).all(axis=1) & np.isfinite(intensity)
         # + 0.0 turns -0.0 into 0.0
         values = (np.clip(intensity[is_measured], -LARGEST, LARGEST) + 0.0).astype(np.float32)
         histogram += np.bincount(values.view(np.uint32) >> 16, minlength=NUM_LEVEL_BINS)
-    levels = (np.arange(NUM_LEVEL_BINS, dtype=np.uint32) << 16).view(
-        np.float32
-    )  # in each bin the nearest to 0
+    bits = np.arange(NUM_LEVEL_BINS, dtype=np.uint32) << 16
+    levels = bits.view(np.float32)  # in each bin the number nearest to 0
     order = np.argsort(levels)
     total = np.cumsum(histogram[order])
-    if total[-1] == 0:  # no point has a position: others refuse that
+    if total[-1] == 0:  # no valid point: the validator refuses the file
         return 0.0, 1.0
-    low, high = levels[
-        order[np.searchsorted(total, np.array([DARK_SHARE, BRIGHT_SHARE]) * total[-1])]
-    ].tolist()
+    places = np.searchsorted(total, np.array([DARK_SHARE, BRIGHT_SHARE]) * total[-1])
+    low, high = levels[order[places]].tolist()
     return low, high

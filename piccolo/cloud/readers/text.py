@@ -1,9 +1,9 @@
 """Lines of numbers, parsed by np.loadtxt a chunk at a time: text files of lines x y z r g b, PTS and PTX.
 
-PTS files have lines x y z intensity r g b after a count of points. PTX files (Leica) have grids of points,
-one scan after another. A scan begins with ten lines: columns, rows, the scanner's position, its three axes,
-and a 4 x 4 matrix for row vectors: [x y z 1]_world = [x y z 1] @ matrix. Then a line x y z intensity r g b
-for each cell.
+PTS files have a count of points, then lines x y z intensity r g b. PTX files (Leica) have grids of points,
+one scan after another. A scan begins with ten lines: number of columns, number of rows, the scanner's
+position, its three axes, and a 4 x 4 matrix for row vectors, [x y z 1]_world = [x y z 1] @ matrix. A line
+x y z intensity r g b follows for each cell of the grid.
 """
 
 import math
@@ -25,7 +25,7 @@ from . import reader, text_columns
 from .reader import MissingChannelError, PointSource, find_brightest, quote_line
 from .text_columns import COMMENT_MARKS, Spelling, split, text_blocks
 
-BYTES_AT_ONCE = 1 << 20  # [byte] read at once; no line is longer
+BYTES_AT_ONCE = 1 << 20  # [byte] read at once; much longer lines are refused
 NUM_WITH_INTENSITY = 4  # columns of a line without colours: x y z intensity
 NUM_POSITION = 3
 WANTED = "wanted lines of numbers x y z r g b (`columns` names others)"
@@ -35,30 +35,30 @@ PTX_COLUMNS: dict[Channel, tuple[int, ...]] = {
     "intensity": (0, 1, 2, 3),
     "shape": (0, 1, 2, 3),
 }
-NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
+NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)  # in the lines of a scan's header in PTX
 MAX_TEXT_COUNT_DIGITS = 9
-AFFINE = (0.0, 0.0, 0.0, 1.0)  # the matrix' last column
-ROUNDED = 1e-6  # by which it may differ
+AFFINE = (0.0, 0.0, 0.0, 1.0)  # last column of a scan's matrix
+ROUNDED = 1e-6  # by which its elements may differ from this
 PTX_WANTED = "wanted a PTX file with lines x y z intensity r g b"
 
 
 class LineLayout(NamedTuple):
-    """The first line of numbers, and the columns of each."""
+    """The lines of numbers in a file: where they begin, their columns, and how they are written."""
 
-    columns: tuple[int, ...] = ()  # that are read
-    num_columns: int | None = None  # of each line; None: there may be any more than those read
-    start: int = 0  # [byte] of the first line
+    columns: tuple[int, ...] = ()  # indices of the columns that are read
+    num_columns: int | None = None  # in each line; None: there may be any number beyond those that are read
+    start: int = 0  # [byte] of the first line of numbers
     delimiter: str | None = None  # None: blanks and tabs
     spelling: Spelling = Spelling()
-    has_counts: bool = False  # a lone whole number counts the lines that follow, and is skipped
+    has_counts: bool = False  # lines with a single whole number are counts of lines, and skipped
 
 
 def line_blocks(path: Path, start: int) -> Iterator[list[bytes]]:
-    """Yield the lines from byte `start` on, some at a time, without their ends (LF, CR LF or CR)."""
+    """Yield lists of lines from byte `start` on, without line ends (LF, CR LF or CR)."""
     rest = b""
     for block in text_blocks(path, BYTES_AT_ONCE, start):
         data = rest + block
-        # A return at the end may be half of a line end: it waits for the next block.
+        # A CR at the end of a block may be the first half of CR LF: it waits for the next block.
         is_split = data.endswith(b"\r")
         end = 1 + max(data.rfind(b"\n"), data.rfind(b"\r", 0, len(data) - is_split))
         rest = data[end:]
@@ -78,7 +78,7 @@ class NumberLines:
         self.layout = layout
         self.wanted = wanted
         self.num_taken = 0
-        # not a method, by which lines would hold each other, and the file open
+        # not a method: the object would refer to itself and keep the file open
         self._kept = partial(_strip_blanks, layout=layout)
         self._lines = chain.from_iterable(map(self._kept, line_blocks(path, layout.start)))
 
@@ -96,13 +96,13 @@ class NumberLines:
         return line
 
     def skip(self, count: int) -> int:
-        """Skip `count` lines, or as many as are left, unparsed; return their number."""
+        """Skip `count` lines, or all that are left, without parsing them; return their number."""
         num_skipped = sum(1 for _ in islice(self._lines, count))
         self.num_taken += num_skipped
         return num_skipped
 
     def read_rows(self, count: int | None = None) -> Iterator[Array]:
-        """Yield the wanted columns (R, C) of `count` lines, or of all that are left, a chunk at once."""
+        """Yield the wanted columns (R, C) of `count` lines, or of all that are left, a chunk at a time."""
         num_columns = self.layout.num_columns or len(self.layout.columns)
         most = max(1, min(reader.POINTS_A_CHUNK, reader.MAX_BLOCK_SIZE // (8 * num_columns)))
         num_rows = 0
@@ -121,7 +121,7 @@ class NumberLines:
         lines = islice(self._lines, count)
         try:
             rows = np.loadtxt(lines, comments=None, delimiter=self.layout.delimiter, usecols=usecols, ndmin=2)
-        except InputError:  # of line_blocks
+        except InputError:  # raised by line_blocks
             raise
         except ValueError as error:
             raise InputError(self._complaint(str(error))) from error
@@ -133,22 +133,22 @@ class NumberLines:
         return rows
 
     def read_points(self, count: int | None = None) -> Iterator[reader.Part]:
-        """Yield the points (N, 3) of the lines that `read_rows` would read, with the other columns.
+        """Yield the points (N, 3) in the lines that `read_rows` reads, with their other columns.
 
-        These are colours (N, 3) if six columns are read, else the last column (N,).
+        These are colours (N, 3) if six columns are read, else the last column (N,) alone.
         """
         is_colored = len(self.layout.columns) == reader.NUM_COLORED
         rows = self.read_rows(count)
         return ((some[:, :3], some[:, 3:] if is_colored else some[:, -1]) for some in rows)
 
     def locate(self, index: int, num_before: int = 0) -> str:
-        """Return the file, and the number in it of the line behind so many lines of numbers."""
+        """Name the file and the line of the row at an index, counted after `num_before` lines of numbers."""
         for number, _ in islice(self._number_lines(), index + num_before, None):
             return f"{self.path}: line {number}"
         raise InputError(f"{self.path}: {reader.CUT}")
 
     def _number_lines(self) -> Iterator[tuple[int, bytes]]:
-        """Read the file again: yield the number in the file and the text of each line of numbers."""
+        """Read the file again: yield the line number and the text of each line of numbers."""
         head = next(text_blocks(self.path, text_columns.TEXT_HEAD_SIZE), b"")
         number = len((head[: self.layout.start] + b".").splitlines()) - 1
         for lines in line_blocks(self.path, self.layout.start):
@@ -157,7 +157,7 @@ class NumberLines:
                 yield from ((number, kept) for kept in self._kept([line]))
 
     def _complaint(self, otherwise: str) -> str:
-        """Describe the first broken line after those taken; with `otherwise` if all seem right."""
+        """Return a message on the first broken line after those taken, or `otherwise` if none is broken."""
         for number, line in islice(self._number_lines(), self.num_taken, None):
             if fault := self._fault(line):
                 return f"{self.path}: line {number}: {fault} ({quote_line(line)}), {self.wanted}"
@@ -177,7 +177,7 @@ class NumberLines:
 
 
 def _strip_blanks(lines: list[bytes], layout: LineLayout) -> list[bytes]:
-    """Strip lines of blanks; return the lines of numbers."""
+    """Return those lines that have numbers, stripped of blanks and in plain spelling."""
     return [
         layout.spelling.plain(line)
         for line in filter(None, map(bytes.strip, lines))
@@ -188,12 +188,13 @@ def _strip_blanks(lines: list[bytes], layout: LineLayout) -> list[bytes]:
 def open_text(
     path: Path, settings: CloudSettings = BY_FILE, channel: Channel = "colors", has_counts: bool = False
 ) -> PointSource:
-    """Return the points of a text file: whitespace, comma or semicolon between numbers.
+    """Return the points of a text file, with whitespace, comma or semicolon between numbers.
 
-    The columns are those of the options, or of a header line with names (x y z, r g b or red green blue, an
-    intensity), or else follow from the values of all columns: with a warning, unless they are x y z r g b.
-    With counts, as PTS has them, a lone number may precede any line; it is not compared with the number of
-    lines, as many programs write a wrong one. All lines must have as many columns as the first one then.
+    The columns are those that the user names, or those of a header line with names (x y z, r g b or red green
+    blue, an intensity). Else they follow from the values of all columns, with a warning unless they are x y z
+    r g b. With `has_counts`, as in PTS files, a line with a single whole number may precede any other; it is
+    not compared with the number of lines, as many programs write a wrong one. In such files all lines must
+    have as many columns as the first one.
     """
     wanted = PTS_WANTED if has_counts else WANTED
     fields = text_columns.read_fields(path, wanted)
@@ -243,17 +244,17 @@ def open_text(
 class PtxScan(NamedTuple):
     """A scan's number of points and columns, and its transform to the world."""
 
-    num_points: int  # lines in the file, with or without a return
-    num_columns: int  # of its first line
+    num_points: int  # lines in the file, including cells without an echo
+    num_columns: int  # in its first line of points
     T_world_from_scanner: Array  # (4, 4)
 
 
 def open_ptx(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
     """Return the points of all scans of a PTX file, in the world.
 
-    0 0 0 means that no beam came back, and is left out. A last scan with fewer lines than its header promises
-    is read up to its end, with a warning; a last line without a line end is then left out as cut off. Scans
-    without the channel are left out, with a warning.
+    A point 0 0 0 means that no beam came back; it is left out. If the last scan has fewer lines than its
+    header promises, it is read as far as it goes, with a warning; its last line is left out if it has no line
+    end, as it may be cut off. Scans without the channel are left out, with a warning.
     """
     lines = NumberLines(path, LineLayout(), PTX_WANTED)
     scans: list[PtxScan] = []
@@ -287,13 +288,13 @@ def open_ptx(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "c
 
 
 def has_ptx_magic(head: bytes) -> bool:
-    """Return True if the bytes `head` begin with counts of columns and rows and a position."""
+    """Return True if `head`, a file's first bytes, has counts of columns and rows, and a position."""
     lines = [line.strip() for line in head.splitlines()[:3]]
     return len(lines) == 3 and None not in map(_numbers, lines, NUMBERS_A_LINE)
 
 
 def _take_header(lines: NumberLines) -> PtxScan | None:
-    """Return the next scan by its header; None at the end."""
+    """Take the header of the next scan and return what it says; None at the end."""
     numbers: list[list[float]] = []
     for num_wanted in NUMBERS_A_LINE:
         line = lines.take_line()
@@ -316,7 +317,10 @@ def _take_header(lines: NumberLines) -> PtxScan | None:
 
 
 def _numbers(line: bytes, num_wanted: int) -> list[float] | None:
-    """Return the finite numbers of a header's line; None if it has others. A single one is a count."""
+    """Return the numbers of a header's line; None if they are not `num_wanted` finite ones.
+
+    A single number must be a count.
+    """
     fields = line.split()
     if num_wanted == 1 and not (line.isdigit() and len(line) <= MAX_TEXT_COUNT_DIGITS):
         return None
@@ -336,9 +340,9 @@ def _ends_with_a_line_end(path: Path) -> bool:
 def _read_scans(
     path: Path, layout: LineLayout, scans: list[PtxScan], brightest: float | None
 ) -> Iterator[reader.Part]:
-    """Yield points (N, 3) whose beam came back, in the world, and their colours (N, 3) or intensity (N,).
+    """Yield the points (N, 3) whose beam came back, in the world, with colours (N, 3) or intensity (N,).
 
-    Colours become bytes if their full brightness is known.
+    Colours become bytes if their full brightness is given.
     """
     lines = NumberLines(path, layout, PTX_WANTED)
     is_colored = len(layout.columns) == reader.NUM_COLORED
@@ -354,7 +358,7 @@ def _read_scans(
         for points, values in parts:
             is_return = np.any(points != 0.0, axis=1)
             returned: Array = points[is_return].astype(np.float64, copy=False)
-            # Not held across a yield: another thread may take the next part, and that state is a thread's.
+            # No yield within: errstate is a thread's, and another thread may take the next part.
             with np.errstate(invalid="ignore", over="ignore"):  # infinite points are left out later
                 points_world = transform_points(returned, scan.T_world_from_scanner)
             yield points_world, values[is_return]
