@@ -1,1 +1,1 @@
-"""The library that a program calls: a scan that is opened, and what is asked of it."""
+"""The library that a program calls: it opens a scan and localizes photos in it."""

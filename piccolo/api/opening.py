@@ -1,4 +1,4 @@
-"""Opening of scans: files or arrays are read and prepared for a method, or a prepared map is read."""
+"""Opening of scans: files or arrays are read and prepared, or a prepared map is read."""
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
@@ -38,7 +38,9 @@ DEFAULT = CoarseToFineSettings()
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """A scan, and what its files do not say of it. A path, a list of paths or an array serves as one.
+    """A scan with options that its files do not contain.
+
+    A path, a list of paths or an array can be used in its place if no option is needed.
 
     Parameters
     ----------
@@ -80,7 +82,7 @@ class Cloud:
     crs: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse values that mean nothing, naming the option."""
+        """Refuse invalid values; the message names the option."""
         check_fields(self)
         if not isinstance(self.source, np.ndarray):
             if self.colors is not None:
@@ -89,11 +91,11 @@ class Cloud:
                 raise InputError("`source`: found no file, wanted a scan's path")
         elif self.units not in (None, "m"):
             raise InputError(f"`units`: found {self.units!r} for arrays, wanted points in metres")
-        self.settings  # noqa: B018  refuses what does not go together
+        self.settings  # noqa: B018  refuses options that do not go together
 
     @property
     def paths(self) -> list[Path]:
-        """Paths of the files; none of an array."""
+        """Paths of the files; empty for an array."""
         if isinstance(self.source, str | PathLike):
             return [Path(self.source)]
         return [] if isinstance(self.source, np.ndarray) else [Path(path) for path in self.source]
@@ -137,7 +139,7 @@ def open_scan(
     Returns
     -------
     Scan
-        Its `warnings` say what may be wrong with the scan, such as its unit or vertical.
+        Its `warnings` name what may be wrong with the scan, such as its unit or vertical.
 
     Raises
     ------
@@ -154,20 +156,19 @@ def open_scan(
     room/images/clean_0.jpg localized
     room/images/clean_1.jpg localized
     """
-    given = cloud if isinstance(cloud, Cloud) else Cloud(cloud)
+    scan = cloud if isinstance(cloud, Cloud) else Cloud(cloud)
     check_kind("settings", settings, Settings)
     check_kind("cache", cache, bool | File)
     check_kind("num_threads", num_threads, int | None)
     check_kind("progress", progress, ProgressCallback | None)
     show = report_progress(progress) if progress else no_progress
     workers = Workers(num_cores() if num_threads is None else num_threads, show)
-    if isinstance(given.source, np.ndarray):
-        stream = stream_of_arrays(
-            given.source, None if given.ignore_colors else given.colors, given.color_range
-        )
-        return prepare_scan(stream, str(ARRAYS), given.settings, settings, workers, Stopwatch())
+    if isinstance(scan.source, np.ndarray):
+        colors = None if scan.ignore_colors else scan.colors
+        stream = stream_of_arrays(scan.source, colors, scan.color_range)
+        return prepare_scan(stream, str(ARRAYS), scan.settings, settings, workers, Stopwatch())
     policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
-    return open_files(given.paths, given.settings, settings, policy, workers)
+    return open_files(scan.paths, scan.settings, settings, policy, workers)
 
 
 def open_files(
@@ -201,7 +202,7 @@ def prepare_scan(
     watch: Stopwatch,
     up: Array | None = None,
 ) -> Scan:
-    """Prepare a scan for the method that the settings belong to; a rotation `up` (3, 3) makes its z up."""
+    """Prepare a scan for the method of the settings; `up` may be a rotation (3, 3) that makes its z up."""
     prepared: ScanMap | PaperMap
     if isinstance(settings, CoarseToFineSettings):
         axis = cloud_settings.up if up is None else up

@@ -1,4 +1,4 @@
-"""Photos as they are read for a scan: pictures, facts, and the results that they begin with."""
+"""Reading of photos for a scan: pictures, facts from their files, and results without a pose yet."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -23,18 +23,18 @@ Settings = CoarseToFineSettings | PaperSettings
 
 @dataclass(frozen=True)
 class PhotoReader:
-    """A scan as its photos need it: they are read for it, and their results repeat it."""
+    """A reader of photos for a scan; it holds what the results of photos repeat of the scan."""
 
-    scan: str | tuple[str, ...]  # its name
+    scan: str | tuple[str, ...]  # name of the scan
     cloud_settings: CloudSettings
-    scan_sha256: str | None
+    scan_sha256: str | None  # digest of the scan's files or arrays
     crs: str  # coordinate system of the scan; empty if it is not known
     warnings: tuple[str, ...]  # about the scan
 
     def take(
         self, photo: Photo, watch: Stopwatch, focal: FocalLength | None = None
     ) -> tuple[Panorama, PhotoFacts]:
-        """Read a photo and its facts; `focal` says what other photos of its camera know, if anything."""
+        """Read a photo and its facts; `focal` may have the focal length by other photos of its camera."""
         with watch.stage("read"), reading_once():
             picture = read_panorama(photo)
             if focal is not None and focal.others_px is not None and focal.others_std_px is not None:
@@ -63,7 +63,10 @@ class PhotoReader:
     def make_failed(
         self, photo: Photo, error: Exception, settings: Settings, name: str | None = None
     ) -> Result:
-        """Return the result of a photo, by `name`, that raised an error; one of the program is raised."""
+        """Return the result of a photo that raised an error; raise the error if it is the program's own.
+
+        `name` replaces the photo's name in the result.
+        """
         name = name or photo.name
         digest = None if isinstance(photo.picture, np.ndarray) else sha256_of(photo.path, photo.instant)
         source = Source(self.scan_sha256, digest)
@@ -72,24 +75,24 @@ class PhotoReader:
         return unreadable_result(text, self.scan, name, is_passing(error), **about)
 
     def make_gps_prior(self, facts: PhotoFacts, prior: Prior) -> GpsPrior | None:
-        """Return a photo's GPS position in the scan; None if it is not known, or not wanted."""
+        """Return a photo's GPS position in the scan; None if it is unknown, or the prior excludes it."""
         gps = facts.gps
         if gps is None or not self.crs or not prior.use_gps or prior.near is not None:
             return None
         place = from_wgs84(self.crs, gps.latitude_deg, gps.longitude_deg)
         if place is None:
             return None
-        radius = 3.0 * max(gps.accuracy or 10.0, 5.0)  # [m] three sigmas; 10 m where the file does not say
+        radius = 3.0 * max(gps.accuracy or 10.0, 5.0)  # [m] three sigmas; 10 m if the file names none
         return GpsPrior(place, radius)
 
 
 def settings_json(settings: Settings, cloud_settings: CloudSettings, photo: Photo) -> dict[str, object]:
-    """Return the settings as a result's JSON has them."""
+    """Return the settings of method, scan and photo in the form of a result's JSON."""
     return {**settings.to_json(), "cloud": asdict(cloud_settings), "panorama": photo.to_json()}
 
 
 def describe_failure(error: Exception) -> str:
-    """Return in one line why a photo has no result; an error of none, but of the program, is raised."""
+    """Return in one line why a photo can't be localized; raise the error if it is the program's own."""
     if isinstance(error, OSError | InputError):
         return text_of(error)
     if is_shortage(error):
@@ -100,6 +103,9 @@ def describe_failure(error: Exception) -> str:
 def unreadable_result(
     error: str, cloud: str | tuple[str, ...], pano: str, is_passing: bool = False, **more: Any
 ) -> Result:
-    """Return the result of a photo that can't be read, or could not at the moment; `more` as in Result."""
+    """Return the result of a photo that can't be read, or could not at the moment (`is_passing`).
+
+    `more` are further fields of Result.
+    """
     status = FAILED if is_passing else UNREADABLE
     return Result(status, 0.0, cloud, pano, error=error, **more)

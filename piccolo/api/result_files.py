@@ -10,26 +10,29 @@ from ..scan_map.open_map import CachePolicy, scan_sha256_of
 from ..system.errors import UNPRINTABLE, InputError
 from ..system.files.json_file import parse_lines, read_bytes
 
-NO_NAME = re.compile("[\ud800-\udc7f\udd00-\udfff]")  # what os.fsdecode never gives
+NO_NAME = re.compile("[\ud800-\udc7f\udd00-\udfff]")  # characters that os.fsdecode never returns
 WANTED = "wanted JSON lines of localize.py"
 
 
 def read_results(paths: Sequence[Path]) -> list[Result]:
-    """Return the results in files of JSON lines, their poses checked.
+    """Return the results in files of JSON lines, with their poses checked.
 
-    Raises InputError if a line is no result, or a file has none.
+    Raise InputError if a line is not a result, or a file has none.
     """
     results = []
     for path in paths:
-        found = parse_lines(path, read_bytes(path, WANTED), _parse_result)
-        if not found:
+        in_file = parse_lines(path, read_bytes(path, WANTED), _parse_result)
+        if not in_file:
             raise InputError(f"{path}: found no result, {WANTED}")
-        results += found
+        results += in_file
     return results
 
 
 def check_scan(results: Sequence[Result], cloud_sha256: str, scan: str, is_forced: bool) -> str:
-    """Words on the results of another scan than that of a digest, if any; without force an InputError."""
+    """Check that results are of the scan with a digest.
+
+    If some are not, raise InputError, or with `is_forced` return words on them for a warning; else return "".
+    """
     others = [r for r in results if r.source.cloud_sha256 not in (None, cloud_sha256)] if cloud_sha256 else []
     if not others:
         return ""
@@ -41,12 +44,12 @@ def check_scan(results: Sequence[Result], cloud_sha256: str, scan: str, is_force
 
 
 def digest_of_scan(paths: Sequence[Path]) -> str:
-    """Return the digest of a scan's files, or of the scan that a prepared map is of."""
+    """Return the digest of a scan's files; for a prepared map, of the files from which it was made."""
     return scan_sha256_of(paths, CachePolicy())
 
 
 def _parse_result(text: str) -> Result:
-    """Return the result of a line; names and numbers that can't be written are refused."""
+    """Return the result in a line. Raise InputError for names and numbers that could not be written again."""
     result = Result.from_json(text)
     texts = {"status": result.status, "cloud": result.cloud_name, "scan": result.scan or ""}
     for label, value in texts.items():

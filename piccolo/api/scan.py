@@ -39,7 +39,7 @@ from .scan_look import Looking, Others
 from .scan_photo import Asked, localize_photo
 from .scan_walk import Walk
 
-OPTIONS = "prior", "gravity", "accuracy", "min_confidence"  # of photos
+OPTIONS = "prior", "gravity", "accuracy", "min_confidence"  # that methods of Scan share
 ONLY_DEFAULT = ("refine_focal", "gravity_vector")  # options of photos that the preset paper does not have
 Picture = File | Bytes | Photo  # a path or an array (H, W, 3) is a photo without options
 
@@ -48,17 +48,21 @@ Picture = File | Bytes | Photo  # a path or an array (H, W, 3) is a photo withou
 class Scan:
     """A scan in which photos can be localized: `open_scan` returns it. Several threads may use it at once.
 
-    Its methods share the options `prior` (by default nothing is known), `gravity` ("known": the camera was
-    upright, or as the photo says; "unknown": any rotation; "auto": both are tried), `accuracy`, how exact a
-    pose must be, and `min_confidence`, the least probability that one is, if it is called localized. One that
-    is None is that of the `settings` of `open_scan`, by default "auto", 0.1 m and 5 degrees, 0.9.
+    Its methods share these options. An option that is None has the value of the `settings` of `open_scan`.
+
+    - `prior`: what is known of the camera's pose; by default nothing.
+    - `gravity`: "known" (the camera was upright, or tilted as the photo's file says), "unknown" (any
+      rotation), or "auto" (both are tried), which is the default.
+    - `accuracy`: the largest errors with which a pose is exact enough; by default 0.1 m and 5 degrees.
+    - `min_confidence`: the least probability, of a pose that is called localized, that it is exact enough; by
+      default 0.9.
     """
 
-    prepared: ScanMap | PaperMap  # for the method that the settings belong to
-    # path as given; a tuple of paths if several files are one scan; "arrays" for arrays
+    prepared: ScanMap | PaperMap  # for the method of the settings
+    # the path as given; a tuple of paths if several files are one scan; "arrays" for arrays
     name: str | tuple[str, ...]
     cloud_settings: CloudSettings
-    settings: Settings  # defaults of photos
+    settings: Settings  # of photos, where options do not replace them
     workers: Workers
     seconds: dict[str, float]  # [s] spent on reading and preparing the scan, by stage
 
@@ -79,9 +83,9 @@ class Scan:
     @property
     def reader(self) -> PhotoReader:
         """Reader of photos for the scan."""
-        named = self.prepared.crs if isinstance(self.prepared, ScanMap) else ""
+        crs_of_files = self.prepared.crs if isinstance(self.prepared, ScanMap) else ""
         digest = self.prepared.scan_sha256 or None
-        crs = self.cloud_settings.crs or named
+        crs = self.cloud_settings.crs or crs_of_files
         return PhotoReader(self.name, self.cloud_settings, digest, crs, self.warnings)
 
     def from_world(self, pose: Pose) -> Pose:
@@ -89,9 +93,9 @@ class Scan:
         return self.prepared.from_world(check_pose(pose, "`pose`"))
 
     def save(self, path: File) -> None:
-        """Write the prepared map to the file `path`, which `open_scan` opens in place of the scan's files.
+        """Write the prepared map to a file, which `open_scan` opens in place of the scan's files.
 
-        Raises InputError for a scan opened with `PaperSettings`, or too large to be prepared as a whole.
+        Raise InputError if the scan was opened with `PaperSettings`, or is too large to prepare as a whole.
         """
         check_kind("path", path, File)
         if not isinstance(self.prepared, ScanMap):
@@ -110,8 +114,8 @@ class Scan:
     ) -> Result:
         """Find the position and rotation of the camera that took a photo.
 
-        The `status` of the result is "localized", "ambiguous" or "not_localized"; not to be found is no
-        error. Raises InputError for a picture that can't be read, and for an option that is invalid.
+        The `status` of the result is "localized", "ambiguous" or "not_localized": it is no error if a photo
+        is not found. Raise InputError for a picture that can't be read, and for an invalid option.
 
         Examples
         --------
@@ -130,7 +134,7 @@ class Scan:
     def localize_photo(
         self, asked: Asked, focal: FocalLength | None = None, trace: Trace = NO_TRACE
     ) -> Result:
-        """Localize a photo by settings of the scan's method, as all who ask for one do (`localize_photo`)."""
+        """Localize a photo by settings of the scan's method, as all methods for single photos do."""
         self.check_options(*asked)
         return localize_photo(self.prepared, self.reader, self.workers, asked, focal, trace)
 
@@ -143,15 +147,15 @@ class Scan:
         accuracy: Accuracy | None = None,
         min_confidence: float | None = None,
     ) -> Iterator[Result]:
-        """Return an iterator over the results of photos, in order; each is computed when it is asked for.
+        """Return an iterator over the results of photos, in order; a photo is localized when it is reached.
 
-        Photos in a sequence, as a list, help each other, as those of one command line: one of a part of the
-        sphere gets a second look, with the focal length that others of its camera have, or beside others that
-        are sure. Results from the first that may still change wait for that. Photos of any other iterable
-        are each localized alone.
+        Photos in a sequence, such as a list, help each other, as on one command line: a photo of a part of
+        the sphere is localized again with the focal length by other photos of its camera, or by its matches
+        with photos that are sure. A result that may still change is held back, and so are those after it.
+        Photos of any other iterable are localized each on its own.
 
-        `prior` is one of all photos, or a list with one of each. The status of a photo that can't be read is
-        "unreadable", or "failed" if another try may succeed; `error` says why.
+        `prior` is the same for all photos, or a list with one for each. The status of a photo that can't be
+        read is "unreadable", or "failed" if another try may succeed; `error` says why.
         """
         check_kind("photos", photos, Iterable[Picture])
         check_kind("prior", prior, Prior | Sequence[Prior | None] | None)
@@ -160,19 +164,19 @@ class Scan:
         if isinstance(prior, Sequence):
             photos = list(photos)
             check_one_each("prior", prior, len(photos), "photo")
-        # refused before the first photo is asked for
+        # refuses invalid options before the first photo is localized
         settings = self._change(None, gravity, accuracy, min_confidence)
-        own = (
+        requests = (
             Asked(as_photo(photo), self._change(prior, gravity, accuracy, min_confidence))
             for photo, prior in zip(photos, priors, strict=False)
         )
         if not may_help:
-            return map(self.try_photo, own)
-        return self.localize_in_order(list(own), settings.min_confidence)
+            return map(self.try_photo, requests)
+        return self.localize_in_order(list(requests), settings.min_confidence)
 
     def localize_in_order(self, asked: Sequence[Asked], min_confidence: float) -> Iterator[Result]:
-        """Localize photos that help each other; yield results in order, each when it is final."""
-        known: dict[tuple[str, str | None], Asked] = {}  # by name and digest
+        """Localize photos that help each other; yield the results in order, each when it is final."""
+        known: dict[tuple[str, str | None], Asked] = {}  # photos so far, by name and digest
         others = Others(self, lambda result: known[result.pano, result.source.pano_sha256])
 
         def localize(one: Asked) -> Result:
@@ -186,9 +190,9 @@ class Scan:
         return localize_in_order(asked, localize, look_again, min_confidence)
 
     def try_photo(self, asked: Asked, localize: Callable[[Asked], Result] | None = None) -> Result:
-        """Localize a photo, by default alone; of one that can't be read return why.
+        """Localize a photo by `localize`, by default on its own; if it can't be read, the result says why.
 
-        Raises InputError for an option that this scan does not have.
+        Raise InputError for an option that this scan does not have.
         """
         self.check_options(*asked)
         try:
@@ -197,13 +201,13 @@ class Scan:
             return self.reader.make_failed(asked.photo, error, asked.settings)
 
     def look_again(self, asked: Asked, look: Look, others: Others) -> Result:
-        """Localize a photo again: with the focal length that others tell, or beside or with others."""
+        """Take a second look at a photo: with the focal length by others, beside others, or together."""
         first = look.first or self.localize_photo(asked, look.focal)
         return self.looking.look(asked, first, look, others)
 
     @property
     def looking(self) -> Looking:
-        """The scan as second looks need it; InputError for the preset paper."""
+        """The scan with what second looks need. Raise InputError for the preset paper."""
         scan_map, _ = self.require_default_method("photos beside others", self.settings)
         return Looking(scan_map, self.reader, self.workers)
 
@@ -219,22 +223,22 @@ class Scan:
     ) -> list[Result]:
         """Localize photos together whose poses relative to each other are known.
 
-        `relative_poses` has one of each photo, in any common frame [m]; RelativePoses are of another scale.
-        Raises InputError for a photo that can't be read.
+        `relative_poses` has the pose of each photo in any common frame [m]; RelativePoses may have another
+        scale. Raise InputError for a photo that can't be read.
         """
         check_kind("photos", photos, Iterable[Picture])
         relative = relative_poses
         if not isinstance(relative, RelativePoses):
             relative = RelativePoses(relative)
-        given = [as_photo(photo) for photo in photos]
-        check_one_each("relative_poses", relative.poses, len(given), "photo")
+        members = [as_photo(photo) for photo in photos]
+        check_one_each("relative_poses", relative.poses, len(members), "photo")
         settings = self._change(prior, gravity, accuracy, min_confidence)
         scan_map, settings = self.require_default_method("`relative_poses`", settings)
-        for photo in given:
+        for photo in members:
             self.check_options(photo, settings)
         asked = [
             AskedPosed(photo, check_pose(pose, "`relative_poses`"), settings)
-            for photo, pose in zip(given, relative.poses, strict=True)
+            for photo, pose in zip(members, relative.poses, strict=True)
         ]
         return localize_posed(scan_map, self.reader, self.workers, asked, relative.scale)
 
@@ -248,9 +252,9 @@ class Scan:
         accuracy: Accuracy | None = None,
         min_confidence: float | None = None,
     ) -> Coloring:
-        """Localize photos, again in each other's colours, and write the scan in their colours to `out`.
+        """Localize photos, then again in the scan with the other photos' colours; write the coloured scan.
 
-        Its suffix is .ply, .las, .laz or .e57. Raises InputError for a scan that is not of files.
+        The suffix of `out` is .ply, .las, .laz or .e57. Raise InputError if the scan was not read from files.
         """
         check_kind("photos", photos, Iterable[Picture])
         check_kind("out", out, File)
@@ -258,8 +262,8 @@ class Scan:
         scan_map, settings = self.require_default_method("color", settings)
         asked = [Asked(as_photo(photo), settings) for photo in photos]
 
-        def localize(shown: ScanMap, one: Asked) -> Result:
-            return replace(self, prepared=shown).try_photo(one)
+        def localize(colored: ScanMap, one: Asked) -> Result:
+            return replace(self, prepared=colored).try_photo(one)
 
         return color_by(self.name, scan_map, self.cloud_settings, asked, localize, Path(out), self.workers)
 
@@ -272,10 +276,10 @@ class Scan:
         accuracy: Accuracy | None = None,
         min_confidence: float | None = None,
     ) -> list[Result]:
-        """Localize photos that were taken at one place or on a short way, in any order, by what they share.
+        """Localize photos together that were taken at one place or on a short way, in any order.
 
-        Photos that show nothing of others are localized alone, and one that can't be read has a result that
-        says so. `beside` of a result names those that it was localized with.
+        They are linked by matches with each other. A photo without a link is localized on its own. The result
+        of a photo that can't be read says so. `beside` of a result names the photos with which it was found.
         """
         check_kind("photos", photos, Iterable[Picture])
         settings = self._change(prior, gravity, accuracy, min_confidence)
@@ -299,9 +303,9 @@ class Scan:
         Returns
         -------
         Walk
-            `add(frame, time=None)` returns the `Result` of the frame, from this frame and earlier ones;
-            `time` [s] increases, and is given for all frames or for none. `finish()` returns a list with the
-            result of each frame, from all frames.
+            `add(frame, time=None)` returns the `Result` of the frame by this frame and earlier ones; `time`
+            [s] increases, and is given for all frames or for none. `finish()` returns a list with the result
+            of each frame by all frames.
         """
         check_kind("motion", motion, Motion | None)
         settings = self._change(prior, gravity, accuracy, min_confidence)
@@ -327,14 +331,14 @@ class Scan:
         frames
             Photos in the order in which they were taken.
         times
-            Time of each frame [s], increasing. Without times only the order counts.
+            Time of each frame [s], increasing. Without times only the order is used.
         odometry
             Pose of the camera at each frame in any common frame [m], or None.
         motion, prior, gravity
             As in `track`.
 
-        `walk` of a result says how its pose was found. Raises InputError if times and frames differ in
-        number, times do not increase, or an option is invalid.
+        `walk` of a result says how its pose was found. Raise InputError if times and frames differ in number,
+        times do not increase, or an option is invalid.
 
         Examples
         --------
@@ -348,20 +352,20 @@ class Scan:
         check_kind("frames", frames, Iterable[Picture])
         check_kind("times", times, Sequence[float] | Floats | None)
         check_kind("odometry", odometry, Sequence[Pose | None] | None)
-        taken = [as_photo(frame) for frame in frames]
-        check_one_each("times", times, len(taken), "frame")
-        check_one_each("odometry", odometry, len(taken), "frame")
-        nothing = [None] * len(taken)
+        photos = [as_photo(frame) for frame in frames]
+        check_one_each("times", times, len(photos), "frame")
+        check_one_each("odometry", odometry, len(photos), "frame")
+        nothing = [None] * len(photos)
         poses = [pose and check_pose(pose, "`odometry`") for pose in odometry or nothing]
-        for frame, time, pose in zip(taken, nothing if times is None else times, poses, strict=True):
+        for frame, time, pose in zip(photos, nothing if times is None else times, poses, strict=True):
             walk.add(frame, time, odometry=pose)
         return walk.finish()
 
     def occlusion_mask(self, photo: Picture, pose: Pose) -> Bytes:
         """Return the pixels of a photo that contradict the scan at a pose, such as moved furniture.
 
-        The array (H, W) of uint8 is a full sphere, W = 2 H, also for a photo of a part of it: 255 where the
-        photo contradicts the scan, 0 where the scan explains it, 128 where one of them shows nothing.
+        The array (H, W) of uint8 is a full sphere, W = 2 H, also if the photo shows only a part of it: 255
+        where the photo contradicts the scan, 0 where the scan explains it, 128 where one shows nothing.
         """
         pose = self.from_world(pose)
         return occlusion_mask(self.points, read_panorama(photo), pose)
@@ -370,19 +374,19 @@ class Scan:
         """Raise InputError for options that this scan or its method does not have."""
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
             check_within(self.prepared, settings.prior.within)
-        elif given := [name for name in ONLY_DEFAULT if getattr(photo, name)]:
-            raise InputError(f"`{given[0]}`: not an option of the preset paper")
+        elif unknown := [name for name in ONLY_DEFAULT if getattr(photo, name)]:
+            raise InputError(f"`{unknown[0]}`: not an option of the preset paper")
 
     def require_default_method(self, what: str, settings: Settings) -> tuple[ScanMap, CoarseToFineSettings]:
-        """Return the map and settings; InputError for the preset paper, which does not have `what`."""
+        """Return map and settings of the default method. Raise InputError for another: it has no `what`."""
         if not isinstance(self.prepared, ScanMap) or not isinstance(settings, CoarseToFineSettings):
             raise InputError(f"{what}: not available with the preset paper")
         return self.prepared, settings
 
     def _change(self, *options: Any) -> Settings:
-        """Return the settings of `open_scan` with OPTIONS that are not None in place of its own."""
-        given = {name: value for name, value in zip(OPTIONS, options, strict=True) if value is not None}
+        """Return the settings of `open_scan`, with the values of OPTIONS that are not None replaced."""
+        changes = {name: value for name, value in zip(OPTIONS, options, strict=True) if value is not None}
         settings = self.settings
-        if unknown := given.keys() - {f.name for f in fields(settings)}:
+        if unknown := changes.keys() - {f.name for f in fields(settings)}:
             raise InputError(f"`{min(unknown)}`: not an option of the preset paper")
-        return replace(settings, **given)
+        return replace(settings, **changes)

@@ -1,4 +1,4 @@
-"""Photos of a scan whose poses relative to each other are known, as `Scan.localize_bundle` localizes them."""
+"""Photos with known relative poses: the work of `Scan.localize_bundle`."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from .photo_reader import PhotoReader
 
 
 class AskedPosed(NamedTuple):
-    """A photo with its pose in a common frame, and the settings by which it is to be localized."""
+    """A photo with its pose in the frame of its bundle, and the settings for localizing it."""
 
     photo: Photo
     cam_from_bundle: Pose
@@ -35,9 +35,9 @@ def localize_posed(
     asked: Sequence[AskedPosed],
     relative_scale: RelativeScale,
 ) -> list[Result]:
-    """Return the results of photos together.
+    """Localize photos as a bundle; return their results in order.
 
-    Raises InputError for a photo that can't be read, and for a focal length that is a guess.
+    Raise InputError for a photo that can't be read, and for a focal length that is a guess.
     """
     if not asked:
         return []

@@ -1,4 +1,4 @@
-"""A scan in the colours of photos, as `Scan.color` makes it."""
+"""A scan in the colours of photos: the work of `Scan.color`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -45,9 +45,10 @@ def color_by(
     out: Path,
     workers: Workers,
 ) -> Coloring:
-    """Localize photos, again in each other's colours, and write the files of a scan's name in these.
+    """Localize photos, then again in the scan with the other photos' colours; write the coloured scan.
 
-    `localize` returns the result of a photo in the scan as it is shown to it.
+    `name` is the path, or the paths, of the scan's files, which are written to `out` in these colours.
+    `localize` returns the result of a photo in a map, which may have the other photos' colours.
     """
     files = [Path(path) for path in ([name] if isinstance(name, str) else name)]
     check_point_files(files)
@@ -56,8 +57,8 @@ def color_by(
     if any(isinstance(one.photo.picture, np.ndarray) for one in asked):
         raise InputError("`photos`: found an array, wanted files, which are read again for their colours")
 
-    def localize_one(shown: ScanMap, k: int) -> Result:
-        result = localize(shown, asked[k])
+    def localize_one(colored: ScanMap, k: int) -> Result:
+        result = localize(colored, asked[k])
         return replace(result, settings={**result.settings, **OF_RESULTS})
 
     steps = [one.photo.name for one in asked]

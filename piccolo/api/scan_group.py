@@ -1,4 +1,4 @@
-"""Photos of a scan that were taken at one place, as `Scan.localize_together` localizes them."""
+"""Photos that were taken at one place: the work of `Scan.localize_together`."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,11 +19,11 @@ from ..together.members import Shot, check_photos
 from ..together.second_looks import digest_of
 from .photo_reader import PhotoReader
 
-OF_RESULTS = {"together": True}  # in their settings
+OF_RESULTS = {"together": True}  # in the settings of these results
 
 
 class AskedTogether(NamedTuple):
-    """A photo, and the settings by which it is to be localized."""
+    """A photo, and the settings for localizing it."""
 
     photo: Photo
     settings: CoarseToFineSettings
@@ -33,9 +33,9 @@ class AskedTogether(NamedTuple):
 def localize_photos_together(
     scan_map: ScanMap, reader: PhotoReader, workers: Workers, asked: Sequence[AskedTogether]
 ) -> list[Result]:
-    """Return the results of photos, localized together as far as they show the same.
+    """Localize photos together, as far as they show the same; return their results in order.
 
-    One that can't be read has a result that says so.
+    The result of a photo that can't be read says so.
     """
     watch = Stopwatch()
     check_photos(len(asked))

@@ -1,4 +1,4 @@
-"""Second looks at photos of a scan: with the focal length that others tell, beside sure ones, or together."""
+"""Second looks at photos: with the focal length by others, beside sure ones, or together."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,14 +27,14 @@ from .scan_photo import Asked
 
 @dataclass(frozen=True)
 class Looking:
-    """A scan of the default method as second looks need it."""
+    """A scan that is prepared for the default method, with what second looks need."""
 
     scan_map: ScanMap
     reader: PhotoReader
     workers: Workers
 
     def place(self, photo: Photo, result: Result, settings: CoarseToFineSettings) -> SurePhoto | None:
-        """Return the keypoints of a photo that is localized; None if it is another, or none, by now."""
+        """Return the keypoints of a localized photo; None if its file has changed, or is gone, since then."""
         taken = self.take_again(photo.with_refined_camera(result.cameras), result, Stopwatch())
         if taken is None or result.best_pose is None:
             return None
@@ -44,7 +44,7 @@ class Looking:
     def take_again(
         self, photo: Photo, known: Result, watch: Stopwatch, focal: FocalLength | None = None
     ) -> tuple[Panorama, PhotoFacts] | None:
-        """Read a photo of which a result is known; None if it is another, or none, by now."""
+        """Read a photo again that has a result; None if its file has changed, or is gone, since then."""
         try:
             taken = self.reader.take(photo, watch, focal)
         except (OSError, InputError) as error:
@@ -54,17 +54,18 @@ class Looking:
         return taken if taken[1].sha256 == known.source.pano_sha256 else None
 
     def localize_series(self, asked: Sequence[Asked], known: Sequence[Result]) -> dict[Result, Result]:
-        """Localize those photos of a series that are not sure with the others.
+        """Localize the photos of a series that are not sure together with the others.
 
-        Returns the results of those that are found by others, by what was known of each.
+        `known` are the results so far. Return the new results of photos that were found by others, by their
+        results so far.
         """
         watch = Stopwatch()
         blanks: dict[Result, Result] = {}
 
         def take(photo: Photo, result: Result, settings: CoarseToFineSettings) -> Panorama | None:
-            is_open = is_doubtful(result)
-            by_camera = photo if is_open else photo.with_refined_camera(result.cameras)
-            taken = self.take_again(by_camera, result, watch, result.focal_length if is_open else None)
+            is_unsure = is_doubtful(result)
+            by_camera = photo if is_unsure else photo.with_refined_camera(result.cameras)
+            taken = self.take_again(by_camera, result, watch, result.focal_length if is_unsure else None)
             if taken is None:
                 return None
             blanks[result] = self.reader.make_blank(photo, *taken, settings, {})
@@ -87,16 +88,16 @@ class Looking:
         return results
 
     def look(self, asked: Asked, first: Result, look: Look, others: "Others") -> Result:
-        """Return the result of a look at a photo, of which `first` is that without the others beside it."""
+        """Return the result of a look at a photo; `first` is its result without the others beside it."""
         if look.series:
             return take_surer(first, others.localize_series(look.series).get(first), look.asked_sha256)
         if look.beside:
             return self.look_beside(asked, first, look, others)
-        # `first` has the focal length that others tell; or none of those it was found beside is sure any more
+        # `first` is by the others' focal length already; or no photo that it was found beside is still sure
         return replace(first, beside=None)
 
     def look_beside(self, asked: Asked, first: Result, look: Look, others: "Others") -> Result:
-        """Return the result of a photo beside those that are sure, with what was asked for it."""
+        """Return the result of a photo beside photos that are sure, with the digest of these photos."""
 
         def list_pictures() -> dict[str, SurePhoto]:
             found = ((result.pano, others.place(result)) for result in look.beside)
@@ -113,18 +114,18 @@ class Looking:
         list_pictures: Callable[[], Mapping[str, SurePhoto]],
         settings: CoarseToFineSettings,
     ) -> tuple[Result, tuple[str, ...]]:
-        """Localize a photo that is not sure, beside others that are; return also the names of these.
+        """Localize a photo that is not sure by its matches with photos that are; return also their names.
 
-        `list_pictures` returns those that are asked, by name. If none shows the same, the result is the first
-        one. A photo whose focal length is a guess is not looked at.
+        `list_pictures` returns the sure photos by name. The result is `first` if none of them shows the same,
+        if the new result is neither surer nor elsewhere, and for a photo whose focal length is a guess.
         """
         watch = Stopwatch(dict(first.seconds))
         picture, facts = self.reader.take(photo, watch, first.focal_length)
         is_another = facts.sha256 != first.source.pano_sha256
         if has_guessed_focal(picture) or self.scan_map.has_shape or is_another:
             return first, ()
-        known = [pose for pose in (first.best_pose, *(a.pose for a in first.alternatives)) if pose]
-        poses = [self.scan_map.from_world(pose) for pose in known]
+        candidates = [pose for pose in (first.best_pose, *(a.pose for a in first.alternatives)) if pose]
+        poses = [self.scan_map.from_world(pose) for pose in candidates]
         with watch.stage("read"):
             pictures = list_pictures()
         found, names = localize_beside(self.scan_map, picture, poses, pictures, settings, self.workers, watch)
@@ -139,7 +140,7 @@ class Looking:
 
 
 def take_surer(first: Result, found: Result | None, asked_sha256: str) -> Result:
-    """Return the result of a photo with its series, or the first one if that is as sure."""
+    """Return the surer of two results of a photo, `first` or `found` with its series, marked as such."""
     if found is None or found.confidence <= first.confidence:
         beside = first.beside or Beside((), asked_sha256)
         return replace(first, beside=replace(beside, is_together=True))
@@ -147,29 +148,29 @@ def take_surer(first: Result, found: Result | None, asked_sha256: str) -> Result
 
 
 class Opened(Protocol):
-    """A scan that looks are taken in; one of the preset paper has none."""
+    """A scan in which second looks are taken; for the preset paper there are none."""
 
     @property
     def looking(self) -> Looking:
-        """Return it for looks; InputError if it has none."""
+        """Return what second looks need. Raise InputError for the preset paper."""
 
 
 class Others:
-    """Other photos of a batch, of which a look asks what it needs."""
+    """The other photos of a batch, which provide a second look with their keypoints or results."""
 
     def __init__(self, scan: Opened, ask: Callable[[Result], Asked]) -> None:
-        """Ask in a scan; `ask` returns a photo by its result, with its settings."""
+        """Take the scan, and a function that returns the photo of a result with its settings."""
         self._scan = scan
         self._ask = ask
         self.place = lru_cache(MOST_PICTURES)(self._place)
-        self.localize_series = lru_cache(1)(self._localize_series)  # those of one follow each other
+        self.localize_series = lru_cache(1)(self._localize_series)  # those of one series come together
 
     def _place(self, result: Result) -> SurePhoto | None:
-        """Return the keypoints of a photo that is sure, by its result."""
+        """Return the keypoints of the photo that has a result, which is sure."""
         photo, settings = self._ask(result)
         assert isinstance(settings, CoarseToFineSettings)
         return self._scan.looking.place(photo, result, settings)
 
     def _localize_series(self, series: tuple[Result, ...]) -> Mapping[Result, Result]:
-        """Return the results of photos that are found by others, by what was known of each."""
+        """Return the new results of photos in a series that are found by others, by their results so far."""
         return self._scan.looking.localize_series([self._ask(result) for result in series], series)

@@ -1,4 +1,4 @@
-"""One photo of a scan, as `Scan.localize` localizes it."""
+"""One photo on its own: the work of `Scan.localize`."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from .photo_reader import PhotoReader, Settings
 
 
 class Asked(NamedTuple):
-    """A photo, and the settings by which it is to be localized."""
+    """A photo, and the settings for localizing it."""
 
     photo: Photo
     settings: Settings
@@ -32,10 +32,11 @@ def localize_photo(
     focal: FocalLength | None = None,
     trace: Trace = NO_TRACE,
 ) -> Result:
-    """Localize a photo in a scan that is prepared for the method of its settings.
+    """Localize a photo in a scan that was prepared for the method of the photo's settings.
 
-    `focal` is its focal length as found with those of others, which counts then. `trace` notes the steps of
-    the default method.
+    `focal` is its focal length by other photos of its camera, which replaces its own. `trace` notes the steps
+    of the default method. A photo with a GPS position is first searched near that, and if it is not localized
+    there, everywhere.
     """
     photo, settings = asked
     watch = Stopwatch()

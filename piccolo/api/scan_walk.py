@@ -1,4 +1,4 @@
-"""A walk through a scan, frame by frame, and its results, as `Scan.track` makes it."""
+"""A walk through a scan, frame by frame, and its results: what `Scan.track` returns."""
 
 import json
 from dataclasses import asdict, replace
@@ -34,9 +34,9 @@ class Prepared(NamedTuple):
     """A frame that is ready to be tracked."""
 
     photo: Photo
-    blank: Result  # without a pose
-    panorama: Panorama | None  # None of one that can't be read
-    problem: Problem | None
+    blank: Result  # without a pose yet
+    panorama: Panorama | None  # None if the frame can't be read
+    problem: Problem | None  # None if the frame can't be read
 
 
 class Walk:
@@ -46,19 +46,19 @@ class Walk:
         self.reader = reader
         self.tracker = tracker
         self.tracker.read = self._read_again
-        self.more_settings: dict[str, object] = {}  # that results repeat
+        self.more_settings: dict[str, object] = {}  # that results list too
         self.photos: list[Photo] = []
         self.blanks: list[Result] = []  # of the frames so far, without poses
-        self.has_times = True  # the frames are given with theirs
+        self.has_times = True  # the frames are given with times
 
     def settings_of(self, photo: Photo) -> dict[str, object]:
-        """Return the settings of a frame as its result repeats them."""
+        """Return the settings of a frame in the form of a result's JSON."""
         settings = settings_json(self.tracker.settings, self.reader.cloud_settings, photo)
         motion = self.tracker.motion
         return {**settings, "walk": {**asdict(motion), "max_speed": motion.speed}, **self.more_settings}
 
     def key_of(self, photo: Photo) -> dict[str, object]:
-        """Return settings, scan and version, which must be the same where a walk goes on."""
+        """Return settings, scan and version, which must be the same if an interrupted walk is continued."""
         settings = json.loads(json.dumps(self.settings_of(photo)))
         digest = self.tracker.scan_map.scan_sha256 or None
         return {"settings": settings, "cloud_sha256": digest, "version": __version__}
@@ -70,22 +70,22 @@ class Walk:
         name: str | None = None,
         odometry: Pose | None = None,
     ) -> Result:
-        """Localize a frame, by it and the frames before.
+        """Localize a frame by this frame and those before.
 
-        A frame that can't be read has a result that says so. `time` [s] counts from any beginning, and is
-        given for all frames or for none; `name` replaces the path in the result. `odometry` is the camera's
-        pose in any frame that all poses of an odometry share [m]. Raises InputError for a focal length that
-        is to be refined.
+        The result of a frame that can't be read says so. `time` [s] counts from any moment, and is given for
+        all frames or for none; `name` replaces the path in the result. `odometry` is the camera's pose [m] in
+        a frame of reference that is the same for the whole walk. Raise InputError for a focal length that is
+        to be refined.
         """
         check_kind("time", time, float | None)
         check_kind("name", name, str | None)
         return self.follow(self.prepare(frame, name), time, odometry)
 
     def prepare(self, frame: File | Bytes | Photo, name: str | None = None) -> Prepared:
-        """Read a frame and prepare what does not depend on other frames; another thread may do it.
+        """Read a frame and do the work that does not depend on other frames; another thread may call this.
 
-        Of a live camera, one thread prepares frames and another follows them. Two cores do most with a scan
-        that was opened with one thread.
+        For a live camera, one thread prepares frames and another follows them. On two cores this is fastest
+        with a scan that was opened with one thread.
         """
         watch = Stopwatch()
         photo = as_photo(frame)
@@ -133,15 +133,15 @@ class Walk:
         return self._result(self.blanks[-1], found, describe_frame(self.tracker.frames, number, None))
 
     def last_to_json(self) -> str:
-        """Return what is known of the last frame on one line, for `restore`."""
-        from msgspec import to_builtins  # noqa: PLC0415  # only walks with a file wait for it
+        """Return the state of the last frame in one line of text, for `restore`."""
+        from msgspec import to_builtins  # noqa: PLC0415  # imported only for walks with a file
 
         kept = self.blanks[-1].to_json(), self.tracker.frames[-1]
-        return json.dumps(to_builtins(kept, enc_hook=np.ndarray.tolist))  # of any name: msgspec's is of UTF-8
+        return json.dumps(to_builtins(kept, enc_hook=np.ndarray.tolist))  # msgspec's is UTF-8 only
 
     def restore(self, text: str, photo: Photo) -> None:
-        """Take the next frame, of a photo, from a text of `last_to_json`; ValueError if it is none."""
-        from msgspec import convert  # noqa: PLC0415  # only walks with a file wait for it
+        """Restore the next frame, a photo's, from a text of `last_to_json`, or raise ValueError."""
+        from msgspec import convert  # noqa: PLC0415  # imported only for walks with a file
 
         kept = tuple[str, Frame]
         blank, frame = convert(json.loads(text), kept, dec_hook=lambda _, rows: np.array(rows))
@@ -150,24 +150,24 @@ class Walk:
         self.tracker.accept(frame)
 
     def finish(self, show: Progress = no_progress) -> list[Result]:
-        """Return the result of each frame, given all frames."""
+        """Return the result of each frame by all frames."""
         found = make_localizations(self.tracker, show)
         return [self._result(blank, *parts) for blank, parts in zip(self.blanks, found, strict=True)]
 
     def _result(self, blank: Result, found: Result, walk: WalkFrame) -> Result:
-        """Return the result of a frame; a frame that can't be read keeps its place in the walk."""
+        """Return the result of a frame; a frame that can't be read has no pose, but keeps its place."""
         blank = replace(blank, walk=walk)
         return blank if blank.error else add_places(self.tracker.scan_map, found).complete(blank)
 
     def _read(self, photo: Photo, name: str) -> Panorama:
-        """Read a photo, which warnings call by its name; its focal length counts as exact."""
+        """Read a photo; its warnings use `name`, and its focal length is taken as exact."""
         panorama = read_panorama(photo)
         path = name if isinstance(photo.picture, np.ndarray) else photo.name
         warnings = tuple(warning.replace(path, name) for warning in panorama.warnings)
         return replace(panorama, focal_prior=None, warnings=warnings)
 
     def _read_again(self, k: int) -> Panorama | None:
-        """Read the photo of an earlier frame; None if it can't be read, or is another now."""
+        """Read the photo of an earlier frame again; None if it can't be read, or its file has changed."""
         photo = self.photos[k]
         blank = self.blanks[k]
         if blank.error is not None:

@@ -1,4 +1,4 @@
-"""The values that a program gives and gets, which commands and applications take from here."""
+"""The types and constants of arguments and results, for commands and applications."""
 
 from ..cloud.cloud_settings import CloudSettings
 from ..geometry.pose import Pose

@@ -1,1 +1,1 @@
-"""A service that localizes the photos which are sent to it, and the page on which they are dropped."""
+"""A service that localizes photos sent by HTTP, and a page on which photos can be dropped."""

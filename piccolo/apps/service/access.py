@@ -1,4 +1,4 @@
-"""Who may ask the service, and by which addresses."""
+"""Access to the service: who may send requests, and to which addresses."""
 
 from typing import NamedTuple
 from urllib.parse import urlsplit
@@ -7,11 +7,11 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 class Access(NamedTuple):
-    """Who may ask, and by which addresses."""
+    """Who may send requests, and to which addresses."""
 
-    token: str | None  # which who asks must know; None lets all of this machine ask
-    public_url: str | None = None  # of the page, behind a proxy; ends in /
-    origins: tuple[str, ...] = ()  # whose pages may ask too
+    token: str | None  # that a request must have; None: any request from this machine is answered
+    public_url: str | None = None  # address of the page behind a proxy; ends in /
+    origins: tuple[str, ...] = ()  # other sites whose pages may send requests
 
     @property
     def path(self) -> str:
@@ -20,5 +20,5 @@ class Access(NamedTuple):
 
     @property
     def is_secure(self) -> bool:
-        """True if browsers ask by HTTPS."""
+        """True if browsers reach the page by HTTPS."""
         return (self.public_url or "").startswith("https:")

@@ -1,4 +1,4 @@
-"""The service over HTTP: photos in, lines of results out; and the page on which photos are dropped."""
+"""The service over HTTP: it takes photos and returns lines of results, and serves the page for them."""
 
 import asyncio
 import json
@@ -37,17 +37,17 @@ from .keep import Keep
 
 LOG = logging.getLogger(__name__)
 MAX_OPTIONS = 1 << 16  # [byte] of the options' text
-MAX_FORM_PARTS = 64  # of a form: more are not read
-SETTLED_S = 1.0  # [s] for which the files of a scan must not change before they are opened again
+MAX_FORM_PARTS = 64  # of a form; one with more is refused
+SETTLED_S = 1.0  # [s] a changed scan is opened again when its files have not changed for so long
 LINES = "application/x-ndjson"
-UNBUFFERED = {"X-Accel-Buffering": "no"}  # nginx: a line is sent on at once
+UNBUFFERED = {"X-Accel-Buffering": "no"}  # tells nginx to pass each line on at once
 CORS: dict[str, Any] = {"allow_methods": ["GET", "POST"], "allow_headers": ["Authorization"]}
 CORS |= {"expose_headers": ["Retry-After"]}
 TYPES = {".js": "text/javascript", ".css": "text/css"}
 
 
 class Service:
-    """Answers requests: of one event loop, while the work is done in other processes."""
+    """The handlers of requests: they run in one event loop, the work is done in other processes."""
 
     def __init__(
         self, open_desk: Callable[[], Desk], limits: RequestLimits, keep: Keep | None, access: Access
@@ -65,7 +65,7 @@ class Service:
         self.desk.close()
 
     async def page(self, request: Request) -> Response:
-        """Return the page, or a file of it."""
+        """Return the page, or one of its files."""
         self.look_for_another_scan()
         name = request.url.path.removeprefix("/")
         if name in self.desk.plans:
@@ -81,15 +81,15 @@ class Service:
         return Response(site.page_under(f"{policy}; connect-src 'self'"), media_type="text/html")
 
     def document(self) -> dict[str, Any]:
-        """Return what the page knows when it opens: the scan, and the photos that are kept."""
+        """Return the data with which the page opens: the scan, and the photos that are kept."""
         photos = self.keep.photos(self.desk.scan_map) if self.keep else []
         return {**self.desk.document, "photos": photos}
 
     async def enter(self, request: Request) -> Response:
-        """Take the token from the address into a cookie."""
-        given = request.query_params.get("token", "")
+        """Move the token from the address into a cookie, and open the page."""
+        sent_token = request.query_params.get("token", "")
         token = self.access.token
-        if token is None or not secrets.compare_digest(given.encode(), token.encode()):
+        if token is None or not secrets.compare_digest(sent_token.encode(), token.encode()):
             raise HTTPException(401, "found another token, wanted the one that the service printed")
         path = self.access.path
         response = RedirectResponse(path, 303)
@@ -98,12 +98,12 @@ class Service:
         return response
 
     async def scan(self, request: Request) -> Response:
-        """Return what is known of the scan: storeys with plans, extent, coordinate system."""
+        """Return the description of the scan: storeys with plans, extent, coordinate system."""
         self.look_for_another_scan()
         return JSONResponse(self.desk.document)
 
     async def health(self, request: Request) -> Response:
-        """Return that the service runs, and how many photos wait."""
+        """Report that the service runs, and how many photos wait."""
         return JSONResponse({"status": "ok", "version": __version__, "waiting": self.num_waiting})
 
     async def describe(self, request: Request) -> Response:
@@ -116,7 +116,7 @@ class Service:
         return Response(text, media_type="text/html")
 
     async def localize(self, request: Request) -> Response:
-        """Return the line of a photo, as localize.py writes it; of several photos a line for each."""
+        """Localize photos; return a line of JSON for each, as localize.py writes it."""
         async with self.asking(request) as sent:
             with self.desk.in_use() as desk:
                 results = await unless_gone(request, self.answer(desk, sent))
@@ -127,7 +127,7 @@ class Service:
         return Response("".join(f"{result.to_json()}\n" for result in results), media_type=LINES)
 
     async def show(self, request: Request) -> Response:
-        """Return photos for the page, of each a line with its result, then a line with its pictures."""
+        """Localize photos for the page; return, for each, a line with its result and one with pictures."""
         async with self.asking(request) as sent:
             with self.desk.in_use() as desk:
                 results = await unless_gone(request, self.answer(desk, sent))
@@ -146,14 +146,14 @@ class Service:
         return StreamingResponse(lines(), media_type=LINES, headers=UNBUFFERED)
 
     async def keep_photo(self, task: Task, result: Result) -> str | None:
-        """Return the name under which a photo is kept, if any is; HTTPException if there is no room."""
+        """Keep a photo, if the service keeps any, and return its name in the folder; else return None."""
         if self.keep is None or result.error is not None:
             return None
         with refusing_shortage():
             return await asyncio.to_thread(self.keep.add, task.photo.name, content_of(task), result)
 
     async def draw(self, desk: Desk, drawing: Drawing, kept: str | None) -> str:
-        """Return JSON of a photo's thumbnail and pictures; keep the thumbnail of one that is kept."""
+        """Return JSON of a photo's thumbnail and pictures; if it is kept, as `kept`, keep the thumbnail."""
         text: str = await work(desk.processes, drawing)
         if self.keep and kept:
             with refusing_shortage():
@@ -163,10 +163,10 @@ class Service:
     async def photo(self, request: Request) -> Response:
         """Return the script with the pictures of a photo that is kept."""
         key = request.path_params["key"]
-        found = await asyncio.to_thread(self.keep.find, key) if self.keep else None
-        if found is None:
+        kept = await asyncio.to_thread(self.keep.find, key) if self.keep else None
+        if kept is None:
             raise HTTPException(404, "found no such photo")
-        content, result = found
+        content, result = kept
         name = Path(result.pano).name
         settings = self.desk.localizer.settings
         with self.place(), self.desk.in_use() as desk:
@@ -178,14 +178,14 @@ class Service:
     async def thumb(self, request: Request) -> Response:
         """Return the thumbnail of a photo that is kept."""
         key = request.path_params["key"]
-        found = await asyncio.to_thread(self.keep.find_thumb, key) if self.keep else None
-        if found is None:
+        thumbnail = await asyncio.to_thread(self.keep.find_thumb, key) if self.keep else None
+        if thumbnail is None:
             raise HTTPException(404, "found no such thumbnail")
-        return Response(found, media_type="image/jpeg")
+        return Response(thumbnail, media_type="image/jpeg")
 
     @asynccontextmanager
     async def asking(self, request: Request) -> AsyncIterator[Sent]:
-        """Yield the photos that were sent, when all of them are there; HTTPException if too many wait."""
+        """Yield the photos of a request when all of it was received. Raise HTTPException if too many wait."""
         self.look_for_another_scan()
         if request.query_params:
             raise HTTPException(400, f"found {min(request.query_params)!r} in the address, {FORM}")
@@ -201,7 +201,7 @@ class Service:
 
     @contextmanager
     def place(self, num: int = 1) -> Iterator[None]:
-        """Hold places for photos among those that wait; HTTPException if all are taken."""
+        """Count `num` photos as waiting within the block. HTTPException if `max_waiting` wait already."""
         if self.num_waiting >= self.limits.max_waiting:
             raise HTTPException(503, f"found {self.num_waiting} photos that wait, try again", RETRY)
         self.num_waiting += num
@@ -211,13 +211,13 @@ class Service:
             self.num_waiting -= num
 
     def settings_of(self, options: dict[str, Any]) -> CoarseToFineSettings:
-        """Return the service's settings with a request's own in their place."""
+        """Return the settings of a request: the service's, replaced where it has options."""
         settings = self.desk.localizer.settings
         assert isinstance(settings, CoarseToFineSettings)
         return apply_options(settings, options)
 
     async def answer(self, desk: Desk, sent: Sent) -> list[Result]:
-        """Localize the photos of a request; HTTPException for one alone that can't be read."""
+        """Localize the photos of a request. Raise HTTPException for a single photo that can't be read."""
         results: list[Result] = await work(desk.processes, sent, len(sent.tasks))
         for result in results:
             if result.status == FAILED:
@@ -231,15 +231,15 @@ class Service:
         return results
 
     def look_for_another_scan(self) -> None:
-        """Begin to open the scan again if its files are others now; until it is open the old one answers."""
+        """Begin to open the scan again if its files have changed; until it is open, the old one is used."""
         if self.reopening is None and look_at(self.desk.localizer.paths) != self.desk.files:
             self.reopening = asyncio.create_task(self.reopen())
 
     async def reopen(self) -> None:
-        """Open the scan again when its files have settled; keep the old one if they can't be read."""
+        """Open the scan again when its files no longer change; keep the old one if they can't be read."""
         paths = self.desk.localizer.paths
-        seen = None
-        while seen != (seen := look_at(paths)):
+        files_now = None
+        while files_now != (files_now := look_at(paths)):
             await asyncio.sleep(SETTLED_S)
         try:
             desk = await asyncio.to_thread(self.open_desk)
@@ -248,7 +248,7 @@ class Service:
             digest = self.desk.scan_map.scan_sha256[:12]
             LOG.warning("the scan was replaced: photos are localized in the new one, SHA-256 %s...", digest)
         except (InputError, OSError) as error:
-            self.desk.files = seen
+            self.desk.files = files_now
             LOG.warning("the scan was replaced by one that can't be opened, the old one stays: %s", error)
         finally:
             self.reopening = None
@@ -256,7 +256,7 @@ class Service:
 
 @asynccontextmanager
 async def reading_form(request: Request) -> AsyncIterator[FormData]:
-    """Yield the form that was sent; HTTPException for a torn one, which says what to send."""
+    """Yield the form of a request. Raise HTTPException for a broken one; it says what to send."""
     limits = {"max_files": MAX_FORM_PARTS, "max_fields": MAX_FORM_PARTS, "max_part_size": MAX_OPTIONS}
     try:
         form = await request.form(**limits)
@@ -271,9 +271,9 @@ async def reading_form(request: Request) -> AsyncIterator[FormData]:
 
 
 async def unless_gone(request: Request, answer: Coroutine[Any, Any, list[Result]]) -> list[Result]:
-    """Return an answer; ClientDisconnect if the client leaves meanwhile: a photo that waits is given up."""
+    """Return an answer, or give it up and raise ClientDisconnect if the client leaves before."""
     answering = asyncio.create_task(answer)
-    leaving = asyncio.ensure_future(request.receive())  # the body was read, so this is all that can come
+    leaving = asyncio.ensure_future(request.receive())  # the body was read: only a disconnection can come
     try:
         await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)
         if not answering.done():
@@ -286,7 +286,7 @@ async def unless_gone(request: Request, answer: Coroutine[Any, Any, list[Result]
 
 
 async def work(processes: Processes, item: object, num: int = 1) -> Any:
-    """Return what a process says of an item; HTTPException for what it refuses, or did not live to say."""
+    """Return a process's answer to an item. Raise HTTPException if it refuses the item, or ends before."""
     future = None
     try:
         future = processes.submit(item, num)
@@ -306,7 +306,7 @@ async def work(processes: Processes, item: object, num: int = 1) -> Any:
 
 
 def photo_document(name: str, result: Result, scan_map: ScanMap) -> dict[str, Any]:
-    """Return what the page knows of a photo that was sent."""
+    """Return the data of a photo, which was just sent, for the page."""
     (short,) = site.shorten_names([result.pano])
     entry = site.document_of_entry(site.Entry(result, None, 0.0), name, secrets.token_hex(16), scan_map)
     return {**entry, "short": short, "hasPictures": True, "thumb": None}

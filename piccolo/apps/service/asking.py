@@ -1,4 +1,4 @@
-"""A request: photos by their names and contents, and their options as JSON."""
+"""The content of a request: photos with names, and their options as JSON."""
 
 import json
 import os
@@ -17,15 +17,15 @@ from ...system.errors import UNPRINTABLE, InputError, printable
 from ...system.files.json_file import DAMAGE
 
 PARTS = ("photo", "prior", "gravity", "accuracy", "min_confidence", "together")
-# options of a photo that name no file
+# options of a photo, without those that are paths of files
 PHOTO = {f.name for f in fields(Photo)} - {"picture", "mask", "rig"}
 PRIOR = {f.name for f in fields(Prior)}
 ACCURACY = {f.name for f in fields(Accuracy)}
 PLACES: dict[str, Collection[str]] = {"options": PARTS, "options.photo": PHOTO, "options.prior": PRIOR}
-# bytes of a photo's name that are kept; a file's name has up to 255, with what is put before it
+# [byte] of a photo's name that are kept: with what is put before it, a file's name can have 255
 MAX_NAME = 240
 FORM = "wanted multipart/form-data with `picture`, a file or several, and perhaps `options`, one text of JSON"
-Pictures = dict[str, bytes]  # contents by names
+Pictures = dict[str, bytes]  # contents of files by name
 
 
 async def read_form(form: FormData) -> tuple[Pictures, str]:
@@ -50,14 +50,14 @@ async def read_form(form: FormData) -> tuple[Pictures, str]:
 
 
 def clean_name(name: str) -> str:
-    """Return the name of a file that was sent, without the folders above; it is no path."""
+    """Return a sent file's name without folders and unprintable characters; it never acts as a path."""
     own = UNPRINTABLE.sub("_", re.split(r"[/\\]", name)[-1])
     kept = os.fsencode(own)[-MAX_NAME:].decode(errors="ignore")
     return kept if kept.strip(". ") else "photo"
 
 
 def parse_options(text: str) -> dict[str, Any]:
-    """Return the options that came as JSON; InputError if they are no object, or one is unknown."""
+    """Return the options in a text of JSON. Raise InputError if it is no object, or has an unknown name."""
     try:
         options = json.loads(text) if text else {}
     except (ValueError, RecursionError) as error:
@@ -66,9 +66,9 @@ def parse_options(text: str) -> dict[str, Any]:
 
 
 def check_object(given: object, known: Collection[str], where: str) -> dict[str, Any]:
-    """Return what a JSON object gives; null is not given.
+    """Return a JSON object without the members that are null.
 
-    Raises InputError for anything else, and for a name that is not known.
+    Raise InputError if it is no object, or has a name that is not among `known`; `where` names it.
     """
     if not isinstance(given, dict):
         raise InputError(f"{where}: found {type(given).__name__}, wanted a JSON object")
@@ -78,14 +78,14 @@ def check_object(given: object, known: Collection[str], where: str) -> dict[str,
 
 
 def describe_unknown(name: str, known: Collection[str]) -> str:
-    """Return words on an option that is unknown, or that belongs elsewhere."""
+    """Return words on a name that is unknown: where it belongs, or which are known."""
     place = next((place for place, names in PLACES.items() if name in names), None)
     wanted = f"it in {place}" if place else f"any of {', '.join(sorted(known))}"
     return f"found {printable(name)[:40]!r}, wanted {wanted}"
 
 
 def make_asked_photo(name: str, options: Mapping[str, Any]) -> Photo:
-    """Return the photo with the options of its part; its calibration is JSON in place of a file."""
+    """Return the photo of a name with the options of a request; its calibration is JSON, not a file."""
     given = check_object(options.get("photo", {}), PHOTO, "options.photo")
     try:
         if "camera" in given:
@@ -96,7 +96,7 @@ def make_asked_photo(name: str, options: Mapping[str, Any]) -> Photo:
 
 
 def are_together(options: Mapping[str, Any]) -> bool:
-    """Return True if the photos are said to be of one place; InputError for what is no truth value."""
+    """Return the option `together`, whether the photos are of one place. InputError if no boolean."""
     given = options.get("together", False)
     if not isinstance(given, bool):
         raise InputError(f"options.together: found {printable(str(given))[:40]!r}, wanted true or false")
@@ -104,7 +104,7 @@ def are_together(options: Mapping[str, Any]) -> bool:
 
 
 def apply_options(settings: CoarseToFineSettings, options: Mapping[str, Any]) -> CoarseToFineSettings:
-    """Return the settings of a photo: those of the service, with the request's own in their place."""
+    """Return the settings of a photo: the service's, replaced where the request has options."""
     given = check_object(options.get("prior", {}), PRIOR, "options.prior")
     wanted = check_object(options.get("accuracy", {}), ACCURACY, "options.accuracy")
     changed = {name: options[name] for name in ("gravity", "min_confidence") if name in options}

@@ -1,4 +1,4 @@
-"""The OpenAPI description of the service; the options in it are those of `Photo`, `Prior` and `Accuracy`."""
+"""The OpenAPI description of the service; its options are the parameters of `Photo`, `Prior`, `Accuracy`."""
 
 import inspect
 import json
@@ -21,7 +21,7 @@ CAMERA = "calibration, as JSON of docs/CAMERAS.md"  # a request has no files
 
 
 def describe_service() -> dict[str, Any]:
-    """Return the description."""
+    """Return the description as a JSON object."""
     text = (files("piccolo.apps.service") / "openapi.json").read_text(encoding="utf-8")
     document: dict[str, Any] = json.loads(text)
     document["info"]["version"] = __version__
@@ -34,7 +34,7 @@ def describe_service() -> dict[str, Any]:
 
 
 def describe_options(kind: type, names: Collection[str]) -> dict[str, Any]:
-    """Return the schema of an object with some of the fields of a dataclass; null is not given."""
+    """Return the schema of a JSON object with the named fields of a dataclass, each of which may be null."""
     texts = read_parameters(kind)
     properties = {
         name: {"oneOf": [*describe_kinds(hint), {"type": "null"}], "description": texts[name]}
@@ -45,7 +45,7 @@ def describe_options(kind: type, names: Collection[str]) -> dict[str, Any]:
 
 
 def describe_kinds(hint: Any) -> list[dict[str, Any]]:
-    """Return the schemas of the types that an annotation names, but for None and those of files."""
+    """Return the schemas of the types in an annotation, without None and, beside Calibration, paths."""
     if get_origin(hint) in (Union, types.UnionType):
         kinds = [part for part in get_args(hint) if part is not type(None)]
         if Calibration in kinds:
@@ -55,7 +55,7 @@ def describe_kinds(hint: Any) -> list[dict[str, Any]]:
 
 
 def describe_kind(hint: Any) -> dict[str, Any]:
-    """Return the schema of a type that is no union."""
+    """Return the schema of a type that is not a union."""
     parts = get_args(hint)
     if get_origin(hint) is Literal:
         return {"type": "string", "enum": list(parts)}
@@ -66,7 +66,7 @@ def describe_kind(hint: Any) -> dict[str, Any]:
 
 
 def describe_items(parts: Collection[Any]) -> dict[str, Any]:
-    """Return the schema of the items of an array, each of one of some types."""
+    """Return the schema of the items of an array, each of which has one of some types."""
     schemas = []
     for part in dict.fromkeys(parts):
         schemas += describe_kinds(part) + ([{"type": "null"}] if type(None) in get_args(part) else [])
@@ -75,7 +75,7 @@ def describe_items(parts: Collection[Any]) -> dict[str, Any]:
 
 
 def read_parameters(kind: type) -> dict[str, str]:
-    """Return the text of each parameter in the documentation of a class."""
+    """Return the text of each parameter in the docstring of a class."""
     found = PARAMETERS.search(inspect.getdoc(kind) or "")
     texts: dict[str, str] = {}
     for names, text in PARAMETER.findall(found[1] if found else ""):

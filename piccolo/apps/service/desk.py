@@ -1,6 +1,6 @@
-"""A scan that is open to questions: what a page shows of it, and the processes that answer.
+"""An open scan of the service: its description for the page, and the processes that localize photos in it.
 
-Photos come as their content: a process writes one into a temporary folder for as long as it is at work on it.
+Photos are sent as contents of files: a process writes a photo into a temporary folder while it works on it.
 """
 
 import os
@@ -31,23 +31,23 @@ MAP = "service.piccolo-map"
 
 
 class RequestLimits(NamedTuple):
-    """Bounds of what a request may take."""
+    """Limits of requests."""
 
-    max_bytes: int  # of its body
-    max_pixels: float  # of a picture, by its header
-    max_waiting: int  # requests at once; one more is sent away
-    seconds: float  # from the moment that a process takes it
+    max_bytes: int  # of a request's body
+    max_pixels: float  # of a picture, as its header says
+    max_waiting: int  # photos at once; while so many wait, requests are refused
+    seconds: float  # [s] that a process may work on a photo
 
 
 class Sent(NamedTuple):
     """The photos of a request."""
 
     tasks: Sequence[Task]
-    are_together: bool  # they are of one place
+    are_together: bool  # they were taken at one place
 
 
 class Drawing(NamedTuple):
-    """A photo whose pictures are wanted, for the page."""
+    """A request for the pictures of a localized photo, for the page."""
 
     task: Task
     result: Result
@@ -55,21 +55,21 @@ class Drawing(NamedTuple):
 
 @dataclass
 class Desk:
-    """An open scan. Its processes open a map of its own, so the scan's files may be replaced meanwhile."""
+    """An open scan. Its processes use a map of their own, so the scan's files may be replaced meanwhile."""
 
     localizer: Localizer
     scan_map: ScanMap
-    document: dict[str, Any]  # what the page knows of the scan
-    plans: dict[str, bytes]  # PNG, by the name that the document has
-    processes: Processes  # of `open_answering`
-    files: object  # what `look_at` said of the scan's files
-    end: ExitStack  # of the folder of the map
-    num_users: int = 0
-    is_retired: bool = False
+    document: dict[str, Any]  # description of the scan for the page
+    plans: dict[str, bytes]  # PNG files, by the names in the document
+    processes: Processes  # that run `open_answering`
+    files: object  # state of the scan's files, as `look_at` returned it
+    end: ExitStack  # that removes the folder of the map
+    num_users: int = 0  # requests that use it now
+    is_retired: bool = False  # it closes when nobody uses it
 
     @contextmanager
     def in_use(self) -> Iterator["Desk"]:
-        """Yield the desk, which stays open within this."""
+        """Yield the desk, which stays open within the block."""
         self.num_users += 1
         try:
             yield self
@@ -78,7 +78,7 @@ class Desk:
             self._close_if_idle()
 
     def retire(self) -> None:
-        """Close when nobody uses it any more."""
+        """Close the desk, now or as soon as nobody uses it."""
         self.is_retired = True
         self._close_if_idle()
 
@@ -95,7 +95,7 @@ class Desk:
 def open_desk(
     localizer: Localizer, num_jobs: int, limits: RequestLimits, keeps_photos: bool, workers: Workers
 ) -> Desk:
-    """Open a scan, with its local features, so that no photo waits for these; InputError if it can't be."""
+    """Open a scan and start its processes. Raise InputError if it can't be opened."""
     files = look_at(localizer.paths)
     opened = localizer.open_scan(workers)
     scan_map, _ = opened.require_default_method("the service", localizer.settings)
@@ -120,24 +120,24 @@ def open_desk(
 
 
 def look_at(paths: Sequence[Path]) -> list[object]:
-    """Return what changes when a file of a scan is replaced or written to."""
-    found: list[object] = []
+    """Return the state of a scan's files, which changes when one is replaced or written to."""
+    states: list[object] = []
     for path in paths:
         try:
             status = path.stat()
-            found.append((status.st_ino, status.st_size, status.st_mtime_ns))
+            states.append((status.st_ino, status.st_size, status.st_mtime_ns))
         except OSError as error:
-            found.append(error.errno)
-    return found
+            states.append(error.errno)
+    return states
 
 
 def open_answering(localizer: Localizer, max_pixels: float) -> Function:
-    """Open what a process answers with.
+    """Open the scan in a process; return the function that answers its items.
 
-    Photos that were sent get their results, and several help each other; a `Drawing` gets the JSON of its
-    pictures; None makes ready for both.
+    For the photos of a request (`Sent`) it returns their results; several photos help each other. For a
+    `Drawing` it returns JSON of the pictures. For None it prepares what both need.
     """
-    tempfile.tempdir = os.environ.get("TMPDIR")  # or it is tried out, and on a full disk found not to exist
+    tempfile.tempdir = os.environ.get("TMPDIR")  # else Python tests it, and rejects it on a full disk
     scan = localizer.open_here()
     answer = localizer.answer_in(scan)
 
@@ -163,18 +163,18 @@ def open_answering(localizer: Localizer, max_pixels: float) -> Function:
 
 
 def check_sent_size(task: Task, max_pixels: float) -> None:
-    """Refuse a picture with more pixels than a service takes, before it is decoded."""
+    """Refuse a picture with more pixels than the service allows, before it is decoded."""
     name = task.photo.name
     width = height = 0
     with suppress(InputError), open_picture(Path(name), content_of(task)) as image:
-        width, height = image.size  # what is no picture is refused by what reads it
+        width, height = image.size  # a file that is no picture is refused later, by its reader
     if width * height > max_pixels:
         found = f"found {width} x {height} px"
         raise InputError(f"{name}: {found}, wanted at most {max_pixels / PIXELS:g} megapixels")
 
 
 def content_of(task: Task) -> bytes:
-    """Return the picture that was sent."""
+    """Return the content of the picture that was sent."""
     return (task.files or {})[task.photo.name]
 
 

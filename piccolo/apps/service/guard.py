@@ -1,4 +1,4 @@
-"""The guard at the door of the service: who may ask, from which page, and how much may be sent."""
+"""The guard of the service: it checks token, host, page and size of each request."""
 
 import asyncio
 import errno
@@ -25,8 +25,9 @@ SHORTAGE = (OSError, MemoryError, ResourceError)
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 COOKIE = "piccolo_token"
 OPEN = ("/health", "/enter")  # paths that need no token
-DROP_S = 10.0  # [s] for what is left of a refused body, before the connection is closed: a client that still
-# sends would not hear the answer; on a connection that stays open uvicorn reads and drops it
+# [s] for which the rest of a refused body is read before the connection is closed: a client that is still
+# sending would miss the answer. On a connection that stays open uvicorn reads the rest itself
+DROP_S = 10.0
 SECURITY = {
     "Content-Security-Policy": "frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
@@ -46,14 +47,14 @@ class Body:
         self._is_whole = False
 
     async def receive(self) -> Message:
-        """Return the next part; HTTPException for one too many."""
+        """Return the next part. Raise HTTPException if the body is larger than the limit."""
         message = await self._next()
         if self._num_bytes > self._max_bytes:
             raise too_large(self._max_bytes)
         return message
 
     async def drop_rest(self) -> None:
-        """Read what is left of a refused one, for a while."""
+        """Read the rest of a refused body, for DROP_S at most."""
         try:
             async with asyncio.timeout(DROP_S):
                 while not self._is_whole:
@@ -69,7 +70,7 @@ class Body:
 
 
 class Guard:
-    """Lets requests through to an application."""
+    """A middleware that passes permitted requests on to an application."""
 
     def __init__(self, app: ASGIApp, max_bytes: int, access: Access) -> None:
         self.app = app
@@ -77,7 +78,7 @@ class Guard:
         self.access = access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, or refuse it in one line."""
+        """Pass a request on, or refuse it with a line of JSON."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -100,12 +101,12 @@ class Guard:
         await self.app(scope, body.receive, answer)
 
     def without_prefix(self, path: str) -> str:
-        """Return the path below that of the page, which proxies may leave in."""
+        """Return a path without the page's own path before it, which some proxies leave in."""
         prefix = self.access.path.rstrip("/")
         return path.removeprefix(prefix) if path.startswith(f"{prefix}/") else path
 
     def check(self, scope: Scope, headers: Headers) -> None:
-        """Raise HTTPException for a request of a foreign host, a foreign page, or without the token."""
+        """Raise HTTPException for a request with a foreign host or page, without the token, or too large."""
         token = self.access.token
         self.check_addresses(headers.get("host", ""), headers.get("origin"))
         if token is not None and scope["path"] not in OPEN and not knows_token(scope, headers, token):
@@ -115,7 +116,7 @@ class Guard:
             raise too_large(self.max_bytes)
 
     def check_addresses(self, host: str, origin: str | None) -> None:
-        """Raise HTTPException for a host or a page that is not of this service."""
+        """Raise HTTPException for a host or an origin that is not this service's."""
         try:
             name = urlsplit(f"//{host}").hostname
             page = host if origin is None else urlsplit(origin).netloc
@@ -132,21 +133,21 @@ class Guard:
 
 
 def knows_token(scope: Scope, headers: Headers, token: str) -> bool:
-    """Return True if the token came as a bearer's, or as the page's cookie."""
+    """Return True if a request has the token, as a bearer token or in the page's cookie."""
     scheme, _, bearer = headers.get("authorization", "").partition(" ")
-    given = bearer if scheme.lower() == "bearer" else Request(scope).cookies.get(COOKIE, "")
-    return secrets.compare_digest(given.encode(), token.encode())
+    sent_token = bearer if scheme.lower() == "bearer" else Request(scope).cookies.get(COOKIE, "")
+    return secrets.compare_digest(sent_token.encode(), token.encode())
 
 
 def too_large(max_bytes: int) -> HTTPException:
-    """Return the refusal of a body."""
+    """Return the refusal of a body that is too large."""
     return HTTPException(413, f"found a larger body, wanted at most {max_bytes} bytes")
 
 
 def refusal_of(error: Exception) -> HTTPException:
-    """Return the refusal where the system gave way, SHORTAGE, and write a line of it into the log.
+    """Return the refusal for an error of SHORTAGE, a lack of disk, memory or files, and log a line.
 
-    507 is a full disk; 503 is memory or files that there were too few of.
+    Its status is 507 for a full disk, else 503.
     """
     LOG.error("a request could not be answered: %s", printable(describe_failure(error)))
     cause = error.__cause__ if isinstance(error, ResourceError) else error
@@ -158,7 +159,7 @@ def refusal_of(error: Exception) -> HTTPException:
 
 @contextmanager
 def refusing_shortage() -> Iterator[None]:
-    """Within this, HTTPException where the system gives way."""
+    """Turn errors of SHORTAGE in the block into an HTTPException."""
     try:
         yield
     except SHORTAGE as error:
@@ -166,5 +167,5 @@ def refusing_shortage() -> Iterator[None]:
 
 
 def answer_refusal(error: HTTPException) -> JSONResponse:
-    """Return the answer of a refusal: its text as JSON, in one line."""
+    """Return the response to a refused request: the refusal's text as JSON, in one line."""
     return JSONResponse({"error": error.detail}, error.status_code, error.headers)

@@ -39,11 +39,11 @@ TOKEN = re.compile(r"[\w-]{8,200}", re.ASCII)
 HERE = "127.0.0.1"
 ANY = ("0.0.0.0", "::")
 MEGABYTE = 1e6
-GRACE_S = 5.0  # [s] for answers to be sent, beyond those of a photo
+GRACE_S = 5.0  # [s] for sending answers, added to the time of a photo
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """All options."""
+    """Add all options."""
     add_cloud_options(parser, "coloured scan as for localize.py, or a map of tools/prepare_map.py")
     option(parser, "--crs CRS", "coordinate system of the cloud, such as EPSG:25832; none: ignore GPS")
     option(parser, "--cache FOLDER", CACHE_TEXT)
@@ -69,7 +69,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 @command(__file__, __doc__, EPILOG, add_arguments)
 def main(arguments: Arguments) -> int:
-    """Open the scan, then answer requests until a signal comes; returns the exit code."""
+    """Open the scan, then answer requests until a signal comes; return the exit code."""
     a = arguments
     a.check_least(jobs=1, port=0, max_megabytes=0.1, max_megapixels=0.01, max_waiting=1, max_seconds=0.1)
     uvicorn = import_optional("tools/serve.py", "uvicorn", "serve")
@@ -93,7 +93,7 @@ def main(arguments: Arguments) -> int:
     localizer = replace(localizer, max_memory=memory)
     keeping = open_keep(a.keep) if a.keep else nullcontext()
     with listening(a.host, a.port) as server, temporary_folder() as folder, keeping as keep:
-        os.environ["TMPDIR"] = str(folder)  # of the processes: what a killed one leaves goes at the end
+        os.environ["TMPDIR"] = str(folder)  # for the processes: what a killed one leaves is removed
         desk = partial(open_desk, localizer, a.jobs, limits, a.keep is not None, a.workers())
         service = Service(desk, limits, keep, access)
         a.warn(service.desk.scan_map.warnings)
@@ -106,7 +106,7 @@ def main(arguments: Arguments) -> int:
 
 
 def access_from(a: Arguments) -> Access:
-    """Return who may ask: with a token, unless that is this machine alone."""
+    """Return who may send requests: those with a token, unless only this machine can reach the service."""
     public_url = None if a.public_url is None else check_url("public_url", a.public_url, True)
     origins = tuple(check_url("allow_origin", url, False) for url in a.allow_origin)
     if a.host in LOOPBACK and not public_url and not a.token:
@@ -117,7 +117,7 @@ def access_from(a: Arguments) -> Access:
 
 
 def check_url(name: str, url: str, is_page: bool) -> str:
-    """Return the address of a page, ending in /, or of a site without a path; InputError for another."""
+    """Return the address of a page, ending in /, or of a site, without a path; else raise InputError."""
     wanted = "http(s)://HOST/PATH/" if is_page else "http(s)://HOST"
     refusal = f"`{name}`: found {printable(url)!r}, wanted {wanted}"
     try:
@@ -131,7 +131,7 @@ def check_url(name: str, url: str, is_page: bool) -> str:
 
 
 def page_address(server: socket.socket) -> str:
-    """Return the page's address."""
+    """Return the page's address for the user."""
     name, port = server.getsockname()[:2]
     if name in ANY:
         name = socket.gethostname()
@@ -140,7 +140,7 @@ def page_address(server: socket.socket) -> str:
 
 
 def choose_token(path: Path | None) -> str:
-    """Return the token in a file, or a new one."""
+    """Return the token in a file, or a new token without a file."""
     if path:
         token = read_text(path, "wanted a token").strip()
         if not TOKEN.fullmatch(token):
@@ -150,7 +150,7 @@ def choose_token(path: Path | None) -> str:
 
 
 def listening(host: str, port: int) -> socket.socket:
-    """Return a socket that listens; InputError if the system gives none."""
+    """Return a listening socket. Raise InputError if the system refuses it."""
     from .connections import listen  # noqa: PLC0415  # the extra is known to be there
 
     try:
