@@ -1,4 +1,4 @@
-"""A photo that is to be localized, what its file does not say, and prior knowledge of the camera's pose."""
+"""A photo with options that its file does not contain, and prior knowledge of the camera's pose."""
 
 import math
 from collections.abc import Sequence
@@ -24,22 +24,24 @@ HEADING_TOLERANCE_DEG = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A photo, and what its file does not say of it. A path or an array serves as one without options.
+    """A photo with options that its file does not contain.
+
+    A path or an array can be used in its place if no option is needed.
 
     Parameters
     ----------
     picture
         Path of a picture (JPEG, PNG, TIFF, WebP, HEIC) or of a folder of six cube faces; or an array
-        (H, W, 3), RGB in uint8, which is a full equirectangular sphere, W = 2 H, or of a given camera.
+        (H, W, 3), RGB in uint8: a full equirectangular sphere, W = 2 H, or the picture of a given camera.
     mask
         **White is ignored**, in a picture of the photo's size, or in a folder of masks named like the
-        photos. For an array photo, a mask (H, W) whose True is ignored. COLMAP, OpenSfM and nerfstudio
-        ignore black: invert their masks.
+        photos. For an array photo, a mask (H, W) that is True where pixels are ignored. COLMAP, OpenSfM and
+        nerfstudio ignore black: invert their masks.
     mask_nadir_deg
         Half angle [deg] of the cap about camera -z that is ignored. Only for files.
     camera
         Calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON of docs/CAMERAS.md; or a
-        folder with NAME.camera.json or NAME.json for each photo that is no sphere.
+        folder with NAME.camera.json or NAME.json for each photo that is not a sphere.
     rig
         Calibration of several cameras; `picture` is the folder of the pictures of one instant.
     focal_px
@@ -53,7 +55,7 @@ class Photo:
         Direction of gravity in camera axes (+x image centre, +y left, +z up), of any length; (0, 0, -1)
         is an upright camera. By default from the file's metadata.
     refine_focal
-        The focal length is known within 20 % only, and is estimated with the pose.
+        The focal length is known within 20 % only; it is estimated with the pose.
     cube_order
         Order of six cube faces in one picture, such as "rludfb" (right, left, up, down, front, back).
 
@@ -78,7 +80,7 @@ class Photo:
     cube_order: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse values that mean nothing, naming the option; read the calibration."""
+        """Refuse invalid values, with the option's name; read the calibration."""
         check_fields(self)
         if self.camera is not None and self.rig is not None:
             raise InputError("`camera`, `rig`: found both, wanted one of them")
@@ -105,12 +107,12 @@ class Photo:
 
     @property
     def calibration(self) -> Calibration | Path | None:
-        """Calibration of the camera, or the folder or model with those of several photos."""
+        """Calibration of the camera, or the path of a folder or model with those of several photos."""
         return Path(self.camera) if isinstance(self.camera, str | PathLike) else self.camera
 
     @property
     def instant(self) -> Calibration | None:
-        """Calibration of the rig whose pictures of one instant are in the folder; None of one picture."""
+        """Calibration of the rig whose pictures of one instant are in the folder; None for one picture."""
         assert self.rig is None or isinstance(self.rig, Calibration)
         return self.rig
 
@@ -121,23 +123,26 @@ class Photo:
         return replace(self, camera=calibration)
 
     def with_refined_camera(self, cameras: tuple[Mount, ...]) -> "Photo":
-        """Return the photo with its refined camera as calibration of the stored picture."""
+        """Return the photo with its refined camera as the calibration of the stored picture.
+
+        A photo of a rig, or of no single camera, is returned as it is.
+        """
         if len(cameras) != 1 or self.rig is not None:
             return self
-        given = find_calibration(self.calibration, self.path)
-        R_lens_from_cam = IDENTITY if given is None or given.is_choice else given.mounts[0].R_lens_from_cam
+        own = find_calibration(self.calibration, self.path)
+        R_lens_from_cam = IDENTITY if own is None or own.is_choice else own.mounts[0].R_lens_from_cam
         mount = replace(cameras[0], R_lens_from_cam=R_lens_from_cam)
         camera = Calibration("the refined camera", (mount,))
         return replace(self, camera=camera, focal_px=None, fov_deg=None, projection=None)
 
     def to_json(self) -> dict[str, object]:
-        """Return the options as a result's JSON has them."""
-        given = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "picture"}
+        """Return the options in the form of a result's JSON."""
+        options = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "picture"}
         for name in ("camera", "rig"):
-            if isinstance(given[name], Calibration):
-                given[name] = asdict(given[name])
-        given["mask"] = "array" if isinstance(self.mask, np.ndarray) else self.mask
-        return {k: str(v) if isinstance(v, PathLike) else v for k, v in given.items()}
+            if isinstance(options[name], Calibration):
+                options[name] = asdict(options[name])
+        options["mask"] = "array" if isinstance(self.mask, np.ndarray) else self.mask
+        return {k: str(v) if isinstance(v, PathLike) else v for k, v in options.items()}
 
     def _check_values(self) -> None:
         """Refuse numbers out of range."""
@@ -155,19 +160,19 @@ class Photo:
             raise InputError(f"`gravity_vector`: found {vector}, wanted three finite numbers, not all 0")
 
     def _list_ways(self) -> list[str]:
-        """List the options that say what the picture shows, in backticks; at most one goes."""
-        given = {
+        """List the given options that say what the picture shows, in backticks; only one is allowed."""
+        is_set = {
             "`camera` or `rig`": self.camera is not None or self.rig is not None,
             "`focal_px`": self.focal_px is not None,
             "`cube_order`": self.cube_order is not None,
             "`fov_deg` or `projection`": self.fov_deg is not None or self.projection is not None,
         }
         if self.focal_px is not None and self.fov_deg is None and self.projection == "pinhole":
-            given["`fov_deg` or `projection`"] = False
-        return [name for name, is_given in given.items() if is_given]
+            is_set["`fov_deg` or `projection`"] = False
+        return [name for name, is_given in is_set.items() if is_given]
 
     def _check_together(self) -> None:
-        """Refuse options that give one thing twice, or belong to different pictures."""
+        """Refuse options that do not go together, and a projection without the angle that it needs."""
         ways = self._list_ways()
         if len(ways) > 1:
             raise InputError(f"{', '.join(ways)}: wanted only one of them")
@@ -176,7 +181,7 @@ class Photo:
             raise InputError(f"{found}, wanted the angle that the width shows")
 
     def _check_array(self, picture: Bytes) -> None:
-        """Refuse an array that is no picture, and options that need a file."""
+        """Refuse an array that is not a picture, and options that need a file."""
         if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
             found = f"{picture.dtype} of shape {picture.shape}"
             raise InputError(f"`picture`: found {found}, wanted RGB in uint8 of shape (H, W, 3)")
@@ -194,24 +199,24 @@ class Photo:
 
 
 def as_photo(photo: File | Bytes | Photo) -> Photo:
-    """Return a photo; a path or an array is one without options."""
+    """Return a photo; a path or an array becomes a photo without options."""
     return photo if isinstance(photo, Photo) else Photo(photo)
 
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior knowledge of a camera's pose: each option narrows the search, a pose against it is refused.
+    """Prior knowledge of a camera's pose: it narrows the search, and poses that contradict it are refused.
 
     Parameters
     ----------
     near, radius
-        The camera is within `radius` [m] of the position `near` (x, y, z) [m]; a z of None is any height.
+        The camera is within `radius` [m] of the position `near` (x, y, z) [m]; if z is None, at any height.
     height
         Least and greatest height of the camera above the floor [m].
     heading_deg, heading_tolerance_deg
         Heading [deg] of the image centre, clockwise from the scan's +y, and its largest error (20).
     within
-        Names of the scans in the map that the camera may be in, by default all.
+        Names of the map's scans in which the camera may be, by default all.
     use_gps
         Search near the GPS position in the photo's file first, if the scan's coordinate system is known.
 
@@ -231,7 +236,7 @@ class Prior:
     use_gps: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse contradictory values, naming the option."""
+        """Refuse invalid and contradictory values; the message names the option."""
         check_fields(self)
         object.__setattr__(self, "within", tuple(self.within))
         numbers = *(self.near or ()), *(self.height or ()), self.radius, self.heading_deg
@@ -251,16 +256,16 @@ class Prior:
     @property
     def tolerance_deg(self) -> float:
         """Largest error [deg] of the heading."""
-        given = self.heading_tolerance_deg
-        return HEADING_TOLERANCE_DEG if given is None else given
+        tolerance_deg = self.heading_tolerance_deg
+        return HEADING_TOLERANCE_DEG if tolerance_deg is None else tolerance_deg
 
     @property
     def is_empty(self) -> bool:
-        """True if nothing is said of the pose."""
+        """True if no option restricts the pose."""
         return replace(self, use_gps=True) == NOTHING_KNOWN
 
     def without_heading(self) -> "Prior":
-        """Return the prior without what it says of the heading."""
+        """Return the prior without its heading."""
         return replace(self, heading_deg=None, heading_tolerance_deg=None)
 
 
@@ -271,9 +276,9 @@ NOTHING_KNOWN = Prior()
 class GpsPrior:
     """A photo's GPS position in the scan, which may be wrong indoors."""
 
-    center_world: tuple[float, float]  # [m] in the scan's coordinates, of any height
+    center_world: tuple[float, float]  # x and y [m] in the scan's coordinates; the height is not known
     radius: float  # [m] within which the camera is searched first
-    is_used: bool = True  # the result lies there; else it was found, or not found, without it
+    is_used: bool = True  # the photo was localized there; if not, it was searched everywhere
 
     def apply_to(self, prior: Prior) -> Prior:
         """Return the prior with this position in place of its own."""

@@ -1,4 +1,4 @@
-"""Cameras: pixels to rays and back, their files, and pictures resampled to the sphere."""
+"""Cameras: pixels to rays and back; calibration files; pictures resampled to the sphere."""
 
 from .calibration import Calibration, Mount
 from .model import Camera

@@ -1,6 +1,6 @@
-"""Calibrations: cameras that take one picture together, each with its place and part; and their files.
+"""Calibrations, of cameras that take a picture together, and their files.
 
-These are COLMAP's cameras.txt and rig_config.json, OpenSfM's camera_models.json, our JSON: docs/CAMERAS.md.
+Files are COLMAP's cameras.txt and rig_config.json, OpenSfM's camera_models.json, our JSON: docs/CAMERAS.md.
 """
 
 import json
@@ -20,7 +20,7 @@ from . import foreign
 from .model import Camera
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-MAX_OFFSET = 0.1  # [m] between cameras that pass for one without a warning
+MAX_OFFSET = 0.1  # [m] from a rig's origin to a camera: a warning names larger offsets
 MAX_CAMERAS = 64
 Rows = tuple[tuple[float, ...], ...]
 FORMAT = "piccolo-camera/1"
@@ -28,8 +28,8 @@ MAX_CALIBRATION_SIZE = 1 << 22  # [byte] of a file
 WANTED = f"wanted COLMAP's cameras.txt or .bin, OpenSfM's camera_models.json, {foreign.READ}: docs/CAMERAS.md"
 MARKUP = (".yaml", ".yml", ".xml")
 WANTED_RIG = "wanted COLMAP's rig_config.json, or the JSON of docs/CAMERAS.md with an image for each camera"
-ANY_SIZE = 1, 1  # of cameras whose file does not say it
-# OpenSfM's projections: COLMAP's model, and OpenSfM's names of its parameters after focal lengths and centre
+ANY_SIZE = 1, 1  # [px] of cameras whose file does not name a size
+# by OpenSfM's projection: COLMAP's model, and OpenSfM's names of its parameters after focal length and centre
 OPENSFM: dict[str, tuple[str, str]] = {
     "perspective": ("RADIAL", "k1 k2"),
     "brown": ("FULL_OPENCV", "k1 k2 p1 p2 k3 - - -"),
@@ -43,19 +43,19 @@ OPENSFM: dict[str, tuple[str, str]] = {
 
 
 def rows(R: Array) -> Rows:
-    """Return a matrix as tuples, which compare and hash."""
+    """Return a matrix as tuples, which can be compared and hashed."""
     return tuple(tuple(row) for row in R.tolist())
 
 
 @dataclass(frozen=True)
 class Mount:
-    """A camera in the frame of the whole, which is that of the pose found."""
+    """A camera at its place in a rig or a picture; the frame `cam` is that of the pose to be found."""
 
     camera: Camera
-    R_lens_from_cam: Rows = IDENTITY  # (3, 3) x_lens = R_lens_from_cam @ (x_cam - center_cam), our axes both
+    R_lens_from_cam: Rows = IDENTITY  # (3, 3) x_lens = R_lens_from_cam @ (x_cam - center_cam), in our axes
     center_cam: tuple[float, ...] = (0.0, 0.0, 0.0)  # [m]
-    offset: tuple[int, int] = (0, 0)  # of its upper left corner in the picture [px], across and down
-    image: str | None = None  # of a rig: which file of the folder is its picture, * and ? as in a shell
+    offset: tuple[int, int] = (0, 0)  # [px] of its part's upper left corner in the picture, across and down
+    image: str | None = None  # in a rig: pattern of its picture's file name, with * and ? as in a shell
 
     def __post_init__(self) -> None:
         check_pose(Pose(self.rotation, np.array(self.center_cam)), "R_lens_from_cam, center_cam")
@@ -68,23 +68,23 @@ class Mount:
         return np.array(self.R_lens_from_cam, dtype=np.float64)
 
     def pose(self, pose: Pose) -> Pose:
-        """Return the camera's own pose, of the whole's."""
+        """Return the pose of this camera, given the pose of the frame `cam`."""
         center_world = pose.center_world + pose.R_cam_from_world.T @ np.array(self.center_cam)
         return Pose(self.rotation @ pose.R_cam_from_world, center_world)
 
     def with_camera(self, camera: Camera) -> "Mount":
-        """Another camera at the same place."""
+        """Return another camera at the same place."""
         return replace(self, camera=camera)
 
     def turn(self, R_cam_from_new: Array) -> "Mount":
-        """Return the same camera in a frame that is turned about the origin."""
+        """Return the same camera in a frame that is turned about the origin by a rotation (3, 3)."""
         R = self.rotation @ R_cam_from_new
         center = R_cam_from_new.T @ np.array(self.center_cam)
         return replace(self, R_lens_from_cam=rows(R), center_cam=tuple(center.tolist()))
 
 
 def compute_extent(mounts: Sequence[Mount]) -> tuple[int, int]:
-    """Width and height [px] of a picture in which cameras have their parts."""
+    """Return width and height [px] of the picture that holds the parts of all cameras."""
     right = max(mount.offset[0] + mount.camera.width for mount in mounts)
     return right, max(mount.offset[1] + mount.camera.height for mount in mounts)
 
@@ -93,10 +93,10 @@ def compute_extent(mounts: Sequence[Mount]) -> tuple[int, int]:
 class Calibration:
     """Cameras of a calibration file; if it lists alternatives, the picture's size selects one."""
 
-    path: str
+    path: str  # of the file, for messages
     mounts: tuple[Mount, ...]
-    is_choice: bool = False  # the cameras have nothing to do with each other
-    has_sizes: bool = True  # False: the file does not say how large the pictures are
+    is_choice: bool = False  # the cameras are alternatives, of which a picture has one
+    has_sizes: bool = True  # the file names the sizes of the pictures
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.mounts) <= MAX_CAMERAS and not self.is_choice:
@@ -109,11 +109,11 @@ class Calibration:
 
     @property
     def extent(self) -> float:
-        """Largest distance [m] of a camera from the origin, which is what is localized."""
+        """Largest distance [m] of a camera from the origin of the frame `cam`, which is localized."""
         return float(np.linalg.norm([mount.center_cam for mount in self.mounts], axis=1).max())
 
     def for_picture(self, width: int, height: int) -> tuple[Mount, ...]:
-        """Return the cameras of a picture of this size [px]; InputError if none fits, or several do."""
+        """Return the cameras of a picture of this size [px]. Raise InputError if none fits, or several do."""
         if not self.is_choice:
             return self._scale(width, height)
         sizes = {(m.camera.width, m.camera.height) for m in self.mounts}
@@ -127,7 +127,7 @@ class Calibration:
         return Calibration(self.path, (fits[0],))._scale(width, height)
 
     def _scale(self, width: int, height: int) -> tuple[Mount, ...]:
-        """All cameras with the whole picture at another size of the same shape."""
+        """Return all cameras for the picture at another size, which must have the same shape."""
         full_width, full_height = compute_extent(self.mounts)
         if len(self.mounts) == 1 and self.mounts[0].offset == (0, 0):
             try:
@@ -140,7 +140,7 @@ class Calibration:
         return self.mounts
 
     def images_in(self, folder: Path) -> list[Path]:
-        """Return the picture of each camera in the folder of one instant; InputError for none or several."""
+        """Return the picture of each camera in the folder of one instant. InputError for none or several."""
         names = _names_in(folder)
         images = []
         for mount in self.mounts:
@@ -161,7 +161,7 @@ class Calibration:
 
 
 def _names_in(folder: Path) -> Sequence[str]:
-    """Return the files of a folder and of those in it, as their names below it have slashes."""
+    """Return the names of the files in a folder and in its subfolders, relative to it, with slashes."""
     try:
         entries = sorted(folder.iterdir())
         inner = [file for entry in entries if entry.is_dir() for file in sorted(entry.iterdir())]
@@ -171,7 +171,7 @@ def _names_in(folder: Path) -> Sequence[str]:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Return the cameras in a file that take one picture, as `read_cameras`; InputError if they are a rig."""
+    """Return the cameras in a file, as `read_cameras` does. Raise InputError if they are a rig."""
     calibration = read_cameras(path)
     if calibration.is_rig:
         raise InputError(f"{path}: found a rig, each camera with an image of its own: give it as `rig`")
@@ -179,7 +179,7 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def read_cameras(path: Path) -> Calibration:
-    """Return the cameras in a file, told by its content; InputError if it holds none."""
+    """Return the cameras in a file, whose content tells its format. Raise InputError if it has none."""
     text = "" if path.suffix.lower() == ".bin" else read_text(path, WANTED, MAX_CALIBRATION_SIZE)
     with naming(path, WANTED):
         if text.lstrip()[:1] in ("{", "["):
@@ -190,7 +190,7 @@ def read_cameras(path: Path) -> Calibration:
 
 
 def calibration_of(document: Any, label: str) -> Calibration:
-    """Return the cameras in the JSON of a calibration's file, which errors call by a label."""
+    """Return the cameras in the parsed JSON of a calibration; `label` names it in messages."""
     path = Path(label)
     with naming(path, WANTED):
         return _of_document(path, document)
@@ -199,7 +199,7 @@ def calibration_of(document: Any, label: str) -> Calibration:
 def read_rig(path: Path) -> Calibration:
     """Return the cameras of a rig in COLMAP's rig_config.json or our own JSON.
 
-    COLMAP's file does not say how large a picture is: its cameras fit a picture of any size, as they are.
+    COLMAP's file does not name the size of a picture: its cameras fit a picture of any size, unscaled.
     """
     text = read_text(path, WANTED_RIG, MAX_CALIBRATION_SIZE)
     with naming(path, WANTED_RIG):
@@ -212,20 +212,20 @@ def read_rig(path: Path) -> Calibration:
 
 
 def document_of(mounts: Sequence[Mount]) -> dict[str, object]:
-    """Cameras as our own JSON has them; of a single one without a list."""
+    """Return cameras in the form of our own JSON; a single camera is not put into a list."""
     entries = [_entry_of(mount) for mount in mounts]
     return {"format": FORMAT, **(entries[0] if len(entries) == 1 else {"cameras": entries})}
 
 
 def read_mounts(document: Mapping[str, Any]) -> tuple[Mount, ...]:
-    """Return the cameras of our own JSON; the error of damaged JSON if it is none."""
+    """Return the cameras of our own JSON. Raise an error of damaged JSON (`naming`) if it is none."""
     if document["format"] != FORMAT:
         raise ValueError(f"format {document['format']!r}, not {FORMAT!r}")
     return tuple(map(_mount_of, document.get("cameras", [document])))
 
 
 def _entry_of(mount: Mount) -> dict[str, object]:
-    """One camera; what is as usual is left out."""
+    """Return the JSON of one camera; values that are the default are left out."""
     usual = vars(Mount(mount.camera))
     camera = {name: value for name, value in asdict(mount.camera).items() if value is not None}
     return camera | {name: value for name, value in vars(mount).items() if value != usual[name]}
@@ -268,7 +268,7 @@ def _of_document(path: Path, document: Any) -> Calibration:
 
 
 def opensfm_cameras(document: Any) -> dict[str, Mount]:
-    """Return the cameras of OpenSfM's camera_models.json or reconstruction.json by name; none of others."""
+    """Return the cameras of OpenSfM's camera_models.json or reconstruction.json by name; else none."""
     if foreign.is_reconstruction(document):
         document = {name: entry for part in document for name, entry in part["cameras"].items()}
     entries = document if isinstance(document, dict) else {}
@@ -287,7 +287,7 @@ def _of_foreign(path: Path, document: Any) -> Calibration:
 def _of_opensfm(entry: Mapping[str, Any]) -> Camera:
     """Return a camera of camera_models.json (opensfm/io.py, https://opensfm.org/docs/geometry.html).
 
-    Lengths there are parts of the larger side, from the picture's middle.
+    Lengths there are fractions of the picture's larger side, positions are from its middle.
     """
     projection = entry["projection_type"]
     if projection not in OPENSFM:
@@ -307,7 +307,7 @@ def _of_opensfm(entry: Mapping[str, Any]) -> Camera:
 
 
 def read_colmap_cameras(path: Path) -> dict[str, Mount]:
-    """Return the cameras of cameras.bin or .txt by id; lines of id, model, width, height, parameters."""
+    """Return the cameras of cameras.bin or .txt by id; a line has id, model, width, height, parameters."""
     if path.suffix.lower() == ".bin":
         text = foreign.read_binary_cameras(read_bytes(path, WANTED, MAX_CALIBRATION_SIZE))
     else:
@@ -331,7 +331,7 @@ def read_colmap_cameras(path: Path) -> dict[str, Mount]:
 
 
 def _of_colmap_rig(path: Path, document: Sequence[Any]) -> Calibration:
-    """Return one rig of rig_config.json (https://colmap.github.io/rigs.html): axes right, down, forward."""
+    """Return the rig of rig_config.json (https://colmap.github.io/rigs.html): axes right, down, forward."""
     if len(document) != 1:
         raise InputError(f"{path}: found {len(document)} rigs, wanted one")
     mounts = []

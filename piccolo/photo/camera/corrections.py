@@ -1,11 +1,11 @@
-"""Corrections of a picture's geometry: what it says of itself may be a little wrong, or wrong altogether.
+"""Corrections of a picture's geometry, which may be a little wrong, or altogether.
 
-A picture claims how its pixels map to rays, by a calibration, or as a sphere that shows 360 by 180 degrees
+A picture claims how its pixels map to rays: by a calibration, or as a sphere that shows 360 by 180 degrees
 with the horizon in the middle. Corrections act in the plane of the picture, (x, y) = (pixel - centre) / focal
-length; of a sphere these are the azimuth to the right and the angle below the horizon [rad]:
+length; for a sphere, x is the azimuth to the right and y the angle below the horizon [rad]:
     of a lens      x' = x exp(f) (1 + k r2) + cx,   y' = y exp(f + a) (1 + k r2) + cy,   r2 = x^2 + y^2;
     of a sphere    x' = x exp(w),                   y' = y exp(h) + cy.
-A sphere cut to 1 / exp(h) of its height and resized is one with h > 0; cy is where its horizon lies.
+A sphere that was cut to 1 / exp(h) of its height and resized has h > 0; cy is the position of its horizon.
 """
 
 import math
@@ -23,16 +23,16 @@ from .model import PARTIAL_SPHERE, Camera
 LENS = ("log_focal", "log_aspect", "center_x", "center_y", "radial")
 FOCAL = LENS.index("log_focal")
 OF_SPHERE = ("log_width", "log_height", "horizon")
-PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")  # of which a place in the plane is a ray
-STEP_PX = 0.01  # with which rays are differentiated by pixels
+PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")  # models in which each point of the plane is a ray
+STEP_PX = 0.01  # step of the differences of rays by pixels
 
 
 class Displaced(NamedTuple):
-    """Points as a picture with corrections shows them, at the same distances; all in the camera's axes."""
+    """Points moved to where a corrected picture shows them, at the same distances; in the camera's axes."""
 
     points: Array32  # (3, N) [m]
-    moves: Array32  # (p, 3, N) their derivatives by the corrections
-    is_shown: Array32  # (N,) 1 of points in front of the lens, else 0
+    moves: Array32  # (p, 3, N) [m] their derivatives by the corrections
+    is_shown: Array32  # (N,) 1 for points that the picture can show, else 0
 
 
 @dataclass(frozen=True)
@@ -52,20 +52,21 @@ class Corrections:
         return OF_SPHERE if self.is_of_sphere else LENS
 
     def displace(self, points_cam: Array32, values: Array) -> Displaced:
-        """Return where points (3, N) are seen if the picture has corrections (p,) that nobody knew of."""
+        """Return points (3, N) [m] moved to where the picture shows them if corrections (p,) are true."""
         camera = self.mount.camera
         if not self.is_of_sphere and camera.model not in PINHOLES:
             return self._displace_in_lens(points_cam, values)
         num = points_cam.shape[1]
         moves = np.empty((len(self.names), 3, num), np.float32)
-        found = Displaced(np.empty((3, num), np.float32), moves, np.empty(num, np.float32))
-        given = np.asarray(values, np.float32)
+        displaced = Displaced(np.empty((3, num), np.float32), moves, np.empty(num, np.float32))
+        values32 = np.asarray(values, np.float32)
         if self.is_of_sphere:
-            displace_on_sphere(points_cam, given, *found)
+            displace_on_sphere(points_cam, values32, *displaced)
         else:
             R_lens_from_cam = np.asarray(self.mount.rotation, np.float32)
-            displace_in_pinhole(points_cam, R_lens_from_cam, np.float32(self.least_ahead), given, *found)
-        return found
+            least_ahead = np.float32(self.least_ahead)
+            displace_in_pinhole(points_cam, R_lens_from_cam, least_ahead, values32, *displaced)
+        return displaced
 
     @property
     def least_ahead(self) -> float:
@@ -83,14 +84,14 @@ class Corrections:
         focal = np.array(camera.focal)
         plane, by_values = correct_plane((pixels - center) / focal, values)
         corrected = plane * focal + center
-        found, _ = camera.rays(corrected)  # also of pixels beyond the picture's edge
+        new_rays, _ = camera.rays(corrected)  # also of pixels beyond the picture's edge
         steps = STEP_PX * np.eye(2)
-        across, down = ((camera.rays(corrected + step)[0] - found) / STEP_PX for step in steps)
+        across, down = ((camera.rays(corrected + step)[0] - new_rays) / STEP_PX for step in steps)
         moves = by_values[..., :1] * focal[0] * across + by_values[..., 1:] * focal[1] * down
         kept = is_ahead[:, None]
         back = R_cam_from_lens.T
         return Displaced(
-            np.ascontiguousarray((np.where(kept, found, rays) @ back).T * ranges, np.float32),
+            np.ascontiguousarray((np.where(kept, new_rays, rays) @ back).T * ranges, np.float32),
             np.ascontiguousarray((np.where(kept, moves, 0.0) @ back).swapaxes(1, 2) * ranges, np.float32),
             is_ahead.astype(np.float32),
         )
@@ -106,7 +107,7 @@ class Corrections:
 
 
 def correct_plane(plane: Array, values: Array) -> tuple[Array, Array]:
-    """Correct places (N, 2) in a lens's plane; return also their derivatives (p, N, 2) by the corrections."""
+    """Correct positions (N, 2) in a lens's plane; return them and derivatives (p, N, 2) by corrections."""
     log_focal, log_aspect, center_x, center_y, radial = values
     x, y = plane.T
     zero = np.zeros_like(x)
@@ -125,9 +126,9 @@ def correct_plane(plane: Array, values: Array) -> tuple[Array, Array]:
 def displace_on_sphere(
     points: Array32, values: Array32, displaced: Array32, moves: Array32, is_shown: Array32
 ) -> None:
-    """Write where points (3, N) are seen on a sphere with corrections (3,), and derivatives (3, 3, N).
+    """Write points (3, N) [m] displaced on a sphere by corrections (3,), and their derivatives (3, 3, N).
 
-    Angles are those to the left and above the horizon; a point beyond the poles or the seam is not shown.
+    Angles are those to the left and above the horizon. A point beyond a pole or the seam is not shown.
     """
     wide = np.float32(math.exp(values[0]))
     high = np.float32(math.exp(values[1]))
@@ -170,9 +171,10 @@ def displace_in_pinhole(
     moves: Array32,
     is_shown: Array32,
 ) -> None:
-    """Write where points (3, N) are seen by a pinhole with corrections (5,), and derivatives (5, 3, N).
+    """Write points (3, N) [m] displaced in a pinhole by corrections (5,), and derivatives (5, 3, N).
 
-    A ray is u = q / |q|, q = (1, -x, -y), and moves by (I - u u^T) dq / |q|. What is not ahead stays.
+    A ray is u = q / |q| with q = (1, -x, -y), and changes by (I - u u^T) dq / |q|. A point that is not in
+    front of the lens (`least_ahead`, the least cosine to the axis) stays where it is.
     """
     R = R_lens_from_cam
     wide = np.float32(math.exp(values[0]))

@@ -1,7 +1,7 @@
 """Calibrations and poses in files of other programs: COLMAP's binary files; JSON, YAML and XML with a matrix.
 
-These are the transforms.json of nerfstudio and of phone apps, the JSON beside a photo of Polycam, Record3D's
-metadata, and files of OpenCV, ROS, Kalibr and Metashape. Their names differ, what they say does not.
+These are the transforms.json of nerfstudio and of phone apps, the JSON that Polycam puts beside a photo,
+Record3D's metadata, and files of OpenCV, ROS, Kalibr and Metashape. They name the same numbers differently.
 """
 
 import math
@@ -18,7 +18,7 @@ from ...system.files.json_file import MAX_JSON_SIZE, is_number, read_bytes, read
 from .model import MODELS, Camera
 
 READ = "JSON of nerfstudio, Polycam or Record3D, YAML of OpenCV, ROS or Kalibr, XML of OpenCV or Metashape"
-MODEL_NUMBERS = {  # of those MODELS that COLMAP has, in its binary files
+MODEL_NUMBERS = {  # numbers of models in COLMAP's binary files
     0: "SIMPLE_PINHOLE",
     1: "PINHOLE",
     2: "SIMPLE_RADIAL",
@@ -44,13 +44,13 @@ HEIGHTS = ("image_height", "height", "h")
 SIZES = ("resolution", "image_size", "imagesize")
 LENS = ("distortion_model", "camera_model", "fisheye_model")
 FISHEYES = ("equidistant", "fisheye", "opencv_fisheye", "kannalabrandt4", "kannala_brandt")
-CORNER = 0.5  # [px] to a picture's corner from the middle of its first pixel, the origin of OpenCV and ROS
-SAME_FOCAL = 0.02  # of frames of one camera that has an autofocus
+CORNER = 0.5  # [px] from a picture's corner to the middle of its first pixel, the origin of OpenCV and ROS
+SAME_FOCAL = 0.02  # relative range of the focal lengths of frames by one camera with autofocus
 MAX_NESTING = 8
 
 
 def read_binary_cameras(content: bytes) -> str:
-    """Return COLMAP's cameras.bin as the text of cameras.txt; ValueError if it is damaged."""
+    """Return COLMAP's cameras.bin as the text of cameras.txt. Raise ValueError if it is damaged."""
     lines = []
     (count,) = _unpack("<Q", content, 0)
     at = 8
@@ -66,12 +66,12 @@ def read_binary_cameras(content: bytes) -> str:
 
 
 def read_images(path: Path, wanted: str) -> list[list[str]]:
-    """Return the rows of COLMAP's images.bin or .txt: number, pose, camera, name; ValueError if damaged."""
+    """Return the rows of COLMAP's images.bin or .txt: number, pose, camera, name. ValueError if damaged."""
     if path.suffix == ".bin":
         return list(_read_binary_images(read_bytes(path, wanted, MAX_JSON_SIZE)))
     lines = [line.strip() for line in read_text(path, wanted).splitlines()]
     rows = [line.split(None, NUM_COLMAP - 1) for line in lines if not line.startswith("#")]
-    return [row for row in rows if not all(map(is_number, " ".join(row).split()))]  # else points
+    return [row for row in rows if not all(map(is_number, " ".join(row).split()))]  # else: points
 
 
 def _read_binary_images(content: bytes) -> Iterator[list[str]]:
@@ -100,7 +100,7 @@ def _unpack(form: str, content: bytes, at: int) -> tuple[Any, ...]:
 
 
 def parse_markup(text: str) -> Any:
-    """Return what YAML or XML holds, as JSON would have it; ValueError if it is damaged."""
+    """Return the content of YAML or XML as parsed JSON would be. Raise ValueError if it is damaged."""
     if text.lstrip().startswith("<"):
         return {"xml": _of_element(parse_xml(text))}
     yaml = import_optional("a calibration in YAML", "yaml", "formats")
@@ -112,7 +112,7 @@ def parse_markup(text: str) -> Any:
 
 
 def parse_xml(text: str) -> ElementTree.Element:
-    """Return the root of XML; ValueError if it is damaged, or has a document type."""
+    """Return the root of XML. Raise ValueError if it is damaged, or has a document type."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("a document type, which is not read")
     try:
@@ -129,7 +129,7 @@ def _of_element(element: ElementTree.Element) -> Any:
 
 
 def cameras_in(document: Any) -> list[Camera]:
-    """Return the cameras that a document describes, wherever it does; frames of one camera count once."""
+    """Return the cameras that a document describes anywhere in it; frames of one camera count once."""
     cameras = list(dict.fromkeys(_search(document, MAX_NESTING)))
     if len(cameras) > 1 and len({(c.width, c.height, c.model) for c in cameras}) == 1:
         focals = np.array([camera.focal[0] for camera in cameras])
@@ -158,14 +158,14 @@ def _first(entry: Mapping[str, Any], names: tuple[str, ...]) -> Any:
 
 
 def _numbers(value: Any) -> list[float]:
-    """Return the numbers of a list, of a list of lists, or of a matrix with its `data`; none of others."""
-    given = value.get("data") if isinstance(value, Mapping) else value
-    flat: Any = np.ravel(given) if isinstance(given, list) else []
+    """Return the numbers in a list, a list of lists, or a matrix with `data`; empty for anything else."""
+    data = value.get("data") if isinstance(value, Mapping) else value
+    flat: Any = np.ravel(data) if isinstance(data, list) else []
     return [float(number) for number in flat]
 
 
 def _camera_of(entry: Mapping[str, Any]) -> Camera | None:
-    """Return the camera of a mapping with lower-case names; None if it describes none."""
+    """Return the camera that a mapping with lower-case names describes, or None."""
     sizes = _numbers(_first(entry, SIZES))
     if isinstance(entry.get("resolution"), Mapping):
         sizes = [float(_first(entry["resolution"], names)) for names in (WIDTHS, HEIGHTS)]
@@ -189,15 +189,15 @@ def _camera_of(entry: Mapping[str, Any]) -> Camera | None:
 
 
 def _matrix_of(entry: Mapping[str, Any], width: int, height: int) -> tuple[float, float, float, float] | None:
-    """Return the focal lengths and the centre [px]; None if there are none."""
+    """Return focal lengths and centre (fx, fy, cx, cy) [px], from a picture's corner; None without."""
     values = _numbers(_first(entry, MATRIX))
     if len(values) == 9:
-        if not (values[2] or values[5]):  # Record3D's matrix goes column after column
+        if not (values[2] or values[5]):  # Record3D's matrix is stored column after column
             return values[0], values[4], values[6], values[7]
         return values[0], values[4], values[2] + CORNER, values[5] + CORNER
     if len(values) == 4:
         return values[0], values[1], values[2] + CORNER, values[3] + CORNER
-    if "f" in entry:  # Metashape's, with the centre from the middle
+    if "f" in entry:  # Metashape's centre is relative to the picture's middle
         focal = float(entry["f"])
         x, y = (float(entry.get(name, 0.0)) for name in ("cx", "cy"))
         return focal + float(entry.get("b1", 0.0)), focal, width / 2.0 + x, height / 2.0 + y
@@ -212,10 +212,10 @@ def _matrix_of(entry: Mapping[str, Any], width: int, height: int) -> tuple[float
 
 
 def _named_coefficients(entry: Mapping[str, Any]) -> list[float]:
-    """Return coefficients in OpenCV's order: k1 k2 p1 p2 k3, or of a fisheye k1 k2 k3 k4."""
+    """Return coefficients in OpenCV's order: k1 k2 p1 p2 k3, or for a fisheye k1 k2 k3 k4."""
     k1, k2, k3, k4, p1, p2 = (float(entry.get(name, 0.0)) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if "fisheye" in str(entry.get("camera_model", "")).lower():
         return [k1, k2, k3, k4]
-    if "f" in entry:  # Metashape has p1 and p2 the other way round
+    if "f" in entry:  # Metashape exchanges p1 and p2
         p1, p2 = p2, p1
     return [k1, k2, p1, p2, k3]

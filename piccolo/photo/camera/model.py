@@ -1,19 +1,19 @@
-"""A camera: its pixels to rays and back, for every projection that pictures come in.
+"""A camera: from pixels to rays and back, for all projections of pictures.
 
 Models, their parameters and pixels are COLMAP's (sensor/models.h, https://colmap.github.io/cameras.html):
-the centre of the upper left pixel is (0.5, 0.5), as everywhere here. OpenCV's is (0, 0): its principal point
-is half a pixel less. Rays are in our camera axes, +x the image centre, +y left, +z up.
+the centre of the upper left pixel is (0.5, 0.5), as everywhere here. In OpenCV it is (0, 0), so its principal
+point is half a pixel less. Rays are in our camera axes, +x the image centre, +y left, +z up.
 
-A ray at the angle theta from the axis comes to the radius r in the plane in front of the lens:
+A ray at the angle theta from the axis meets the plane in front of the lens at the radius r:
     perspective r = tan theta;  equidistant r = theta (Kannala and Brandt, 2006);
     FOV r = atan(2 tan(omega / 2) tan theta) / omega (Devernay and Faugeras, 2001).
-Of a partial sphere x is the azimuth to the right and y the angle below the horizon [rad].
-Then it is distorted, with r2 = x^2 + y^2, as OpenCV (modules/calib3d, "Detailed description") has it:
+In a partial sphere x is the azimuth to the right and y the angle below the horizon [rad]. The point (x, y) is
+distorted as in OpenCV (modules/calib3d, "Detailed description"), with r2 = x^2 + y^2:
     g  = (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) / (1 + d1 r2 + d2 r2^2 + d3 r2^3),
     x' = x g + 2 p1 x y + p2 (r2 + 2 x^2) + sx1 r2,
     y' = y g + p1 (r2 + 2 y^2) + 2 p2 x y + sy1 r2,
-and u = fx x' + cx, v = fy y' + cy. d1..d3 are OpenCV's k4..k6 of the rational model. Of a fisheye lens (x, y)
-has the length of the angle.
+and u = fx x' + cx, v = fy y' + cy. d1..d3 are k4..k6 of OpenCV's rational model. For a fisheye lens the
+length of (x, y) is the angle theta.
 """
 
 import math
@@ -28,17 +28,17 @@ from ...geometry.sphere import compute_pixels, compute_rays
 from ...system.arrays import Array, Mask
 from ...system.errors import InputError
 
-MAX_STEPS = 25  # of Newton; five are usual
-LEAST = 1e-12  # of the denominator
-NO_MORE = 1e-30  # of a coefficient: less does nothing at any radius, but overflows
-CONVERGED = 1e-12  # of x' and y': a thousandth of a millionth of a pixel
+MAX_STEPS = 25  # of Newton's method; five are usual
+LEAST = 1e-12  # a smaller denominator counts as this
+NO_MORE = 1e-30  # a smaller coefficient changes nothing at any radius, but makes roots overflow
+CONVERGED = 1e-12  # error of x' and y' at which Newton's method ends: 1e-9 of a pixel
 PERSPECTIVE = "perspective"
 EQUIDISTANT = "equidistant"
 FOV = "fov"
 SPHERE = "sphere"
 PARTIAL_SPHERE = "partial sphere"
-CUT_SPHERE = "PARTIAL_EQUIRECTANGULAR"  # the one model that is not COLMAP's
-# lens, and names of the parameters as the formulas here have them
+CUT_SPHERE = "PARTIAL_EQUIRECTANGULAR"  # the only model that is not COLMAP's
+# lens, and the names of the parameters in the formulas above
 MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     model: (lens, tuple(names.split()))
     for model, lens, names in (
@@ -61,12 +61,12 @@ MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 FOCALS = "f", "fx", "fy"
 RADIAL = "k1"
-MAX_PERSPECTIVE = math.radians(89.9)  # half angle: no plane shows more
-MAX_ASPECT_ERROR = 0.01  # of a calibration of another size
+MAX_PERSPECTIVE = math.radians(89.9)  # half angle that a plane can show
+MAX_ASPECT_ERROR = 0.01  # relative, between a picture and its calibration at another size
 MAX_CAMERA_NUMBER = 1e6
 MIN_FOCAL = 1.0  # [px]
-TABLE_SIZE = 4096  # angles at which the radial part is tabulated, for Newton's first guess
-SMALL = 1e-4  # [rad] from the axis, at which the resolution is taken
+TABLE_SIZE = 4096  # angles at which the radial part is tabulated, for the start of Newton's method
+SMALL = 1e-4  # [rad] from the axis, over which the resolution is measured
 
 
 class Distortion(NamedTuple):
@@ -86,16 +86,16 @@ class Distortion(NamedTuple):
 
     @property
     def numerator(self) -> Polynomial:
-        """Of g, in r2."""
+        """Numerator of g as a polynomial in r2."""
         return Polynomial([1.0, self.k1, self.k2, self.k3, self.k4]).trim()
 
     @property
     def denominator(self) -> Polynomial:
-        """Of g, in r2."""
+        """Denominator of g as a polynomial in r2."""
         return Polynomial([1.0, self.d1, self.d2, self.d3]).trim()
 
     def radial(self, r2: Array) -> tuple[Array, Array]:
-        """Values g and dg/dr2 at r2, of any shape."""
+        """Return g and dg/dr2 at r2, an array of any shape."""
         n = self.numerator
         d = self.denominator
         above = n(r2)
@@ -108,7 +108,7 @@ class Distortion(NamedTuple):
         return value, (slope - value * d.deriv()(r2)) / below
 
     def max_radius(self) -> float:
-        """Radius up to which r g(r^2) grows, infinite if it always does: beyond, a pixel is two rays."""
+        """Return the radius up to which r g(r^2) grows, or infinity: beyond, two rays have the same pixel."""
         if self == Distortion():
             return math.inf
         n = self.numerator
@@ -120,7 +120,7 @@ class Distortion(NamedTuple):
         return math.sqrt(min(real[real > 0.0], default=math.inf))
 
     def apply(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Return the distorted (x', y') of (x, y), arrays of one shape."""
+        """Return the distorted (x', y') of (x, y), arrays of the same shape."""
         r2 = x * x + y * y
         xy = 2.0 * x * y
         g, _ = self.radial(r2)
@@ -130,7 +130,7 @@ class Distortion(NamedTuple):
         )
 
     def jacobian(self, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-        """Return derivatives dx'/dx, dx'/dy, dy'/dx, dy'/dy at (x, y), arrays of one shape."""
+        """Return the derivatives dx'/dx, dx'/dy, dy'/dx, dy'/dy at (x, y), arrays of the same shape."""
         g, by_r2 = self.radial(x * x + y * y)
         both = 2.0 * x * y * by_r2 + 2.0 * (self.p1 * x + self.p2 * y)
         return (
@@ -141,14 +141,15 @@ class Distortion(NamedTuple):
         )
 
     def keeps_sides(self, x: Array, y: Array) -> Mask:
-        """Return True where the distortion does not turn the picture inside out."""
+        """Return True where the distortion does not mirror the picture: its Jacobian is positive."""
         a, b, c, d = self.jacobian(x, y)
         return np.asarray(a * d - b * c > 0.0)
 
     def invert(self, x_distorted: Array, y_distorted: Array, radii: Array) -> tuple[Array, Array, Mask]:
-        """Return the (x, y) whose distortion is (x', y'), and where it was found, arrays of one shape.
+        """Return the (x, y) whose distortion is (x', y'), and a mask of those found, all of the same shape.
 
-        By Newton, from the inverse of the radial part, which grows over `radii` (N,), the last its limit.
+        Newton's method starts from the inverse of the radial part, which is tabulated at `radii` (N,): it
+        grows over these, and the last is its limit.
         """
         length = np.hypot(x_distorted, y_distorted)
         begin = np.interp(length, radii * self.radial(radii**2)[0], radii) / np.maximum(length, 1e-300)
@@ -174,13 +175,13 @@ class Distortion(NamedTuple):
 
 @dataclass(frozen=True)
 class Camera:
-    """A calibrated camera; two with equal fields are the same."""
+    """A calibrated camera; two cameras with equal fields are equal."""
 
     model: str  # one of MODELS
     width: int  # [px]
     height: int  # [px]
     params: tuple[float, ...]  # in COLMAP's order
-    max_angle_deg: float | None = None  # from the axis; beyond, nothing is shown (a fisheye's circle)
+    max_angle_deg: float | None = None  # from the axis, beyond which nothing is shown (a fisheye's circle)
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
@@ -200,11 +201,11 @@ class Camera:
 
     @property
     def lens(self) -> str:
-        """Return the projection, which turns the angle from the optical axis into a radius."""
+        """The projection, which turns the angle from the optical axis into a radius."""
         return MODELS[self.model][0]
 
     def change(self, log_focal: float, k1: float = 0.0) -> "Camera":
-        """Return the camera with changes of its focal length's logarithm and, if it has one, of its k1."""
+        """Return the camera with changes of its focal length's logarithm and, if it has one, its k1."""
         factors = dict.fromkeys(FOCALS, math.exp(log_focal))
         steps = {RADIAL: k1}
         params = (value * factors.get(n, 1.0) + steps.get(n, 0.0) for n, value in self._named.items())
@@ -216,7 +217,7 @@ class Camera:
 
     @property
     def focal(self) -> tuple[float, float]:
-        """Pixels a unit of the plane, across and down; of a sphere pixels a radian."""
+        """Pixels per unit of the plane, across and down; for a sphere, pixels per radian."""
         if self.lens == SPHERE:
             return self.width / (2.0 * math.pi), self.height / math.pi
         f = self._named.get("f", 0.0)
@@ -224,17 +225,17 @@ class Camera:
 
     @property
     def center(self) -> tuple[float, float]:
-        """Pixel of the optical axis, of a lens."""
+        """Pixel (cx, cy) of the optical axis; only for models that have one, not EQUIRECTANGULAR."""
         return self._named["cx"], self._named["cy"]
 
     @cached_property
     def distortion(self) -> Distortion:
-        """The coefficients that this model has."""
+        """The distortion; coefficients that the model does not have are 0."""
         return Distortion(**{k: v for k, v in self._named.items() if k in Distortion._fields})
 
     @cached_property
     def max_angle(self) -> float:
-        """Angle [rad] from the axis up to which there is one pixel for each ray."""
+        """Angle [rad] from the axis up to which each ray has a pixel of its own."""
         limits = {PERSPECTIVE: MAX_PERSPECTIVE, FOV: MAX_PERSPECTIVE}.get(self.lens, math.pi)
         radius = self.distortion.max_radius()
         if math.isfinite(radius):
@@ -243,14 +244,14 @@ class Camera:
 
     @property
     def resolution(self) -> float:
-        """Pixels a radian at the axis, at least MIN_FOCAL."""
+        """Pixels per radian at the axis, at least MIN_FOCAL."""
         off = np.array([[math.cos(SMALL), -math.sin(SMALL), 0.0], [math.cos(SMALL), 0.0, -math.sin(SMALL)]])
         pixels, _ = self.pixels(np.array([[1.0, 0.0, 0.0], *off]))
         steps = np.linalg.norm(pixels[1:] - pixels[0], axis=1) / SMALL
         return max(float(np.sqrt(steps[0] * steps[1])), MIN_FOCAL)
 
     def scale_to_size(self, width: int, height: int) -> "Camera":
-        """Return the same camera with its picture at another size; InputError if that has another shape."""
+        """Return the same camera with its picture at another size. InputError if that has another shape."""
         if (width, height) == (self.width, self.height):
             return self
         across = width / self.width
@@ -268,7 +269,7 @@ class Camera:
         return self.scale_to_size(width, max(1, round(width * self.height / self.width)))
 
     def pixels(self, rays: Array) -> tuple[Array, Mask]:
-        """Return pixels (..., 2) of rays (..., 3) of any length, and which are in the picture (...)."""
+        """Return pixels (..., 2) of rays (..., 3) of any length, and a mask (...) of those in the picture."""
         if self.lens == SPHERE:
             u, v = compute_pixels(rays, self.width)
             return np.stack([u, v * (2.0 * self.height / self.width)], axis=-1), np.ones(u.shape, np.bool_)
@@ -294,14 +295,14 @@ class Camera:
         return self._place(x, y, is_in)
 
     def _place(self, x: Array, y: Array, is_in: Mask) -> tuple[Array, Mask]:
-        """Return pixels (..., 2) of places in the plane (...), and which are in the picture."""
+        """Return pixels (..., 2) of points (x, y) of the plane, and a mask (...) of those in the picture."""
         u = self.focal[0] * x + self._named["cx"]
         v = self.focal[1] * y + self._named["cy"]
         is_in = is_in & (u >= 0.0) & (u <= self.width) & (v >= 0.0) & (v <= self.height)
         return np.stack([u, v], axis=-1), is_in
 
     def rays(self, pixels: Array) -> tuple[Array, Mask]:
-        """Return unit rays (..., 3) of pixels (..., 2), and which of them there are (...)."""
+        """Return the unit rays (..., 3) of pixels (..., 2), and a mask (...) of the pixels that have one."""
         u, v = np.moveaxis(np.asarray(pixels, np.float64), -1, 0)
         if self.lens == SPHERE:
             ray = compute_rays(u, v * (0.5 * self.width / self.height), self.width)
@@ -328,7 +329,7 @@ class Camera:
         return self._radius(np.linspace(0.0, self.max_angle, TABLE_SIZE))
 
     def _radius(self, angle: Array) -> Array:
-        """Radius before the distortion of an angle [rad] from the axis."""
+        """Return the radius, before distortion, of an angle [rad] from the axis."""
         if self.lens == EQUIDISTANT:
             return angle
         if self.lens == PERSPECTIVE:
@@ -337,7 +338,7 @@ class Camera:
         return np.asarray(np.arctan(2.0 * math.tan(omega / 2.0) * np.tan(angle)) / omega)
 
     def _angle(self, radius: Array) -> Array:
-        """Return the inverse of `_radius`."""
+        """Return the angle [rad] from the axis of a radius before distortion."""
         if self.lens == EQUIDISTANT:
             return radius
         if self.lens == PERSPECTIVE:
@@ -348,18 +349,21 @@ class Camera:
 
 
 def pinhole(width: int, height: int, focal: float) -> Camera:
-    """Return an ideal photo of this size and focal length [px], its axis in the middle."""
+    """Return an ideal pinhole camera of this size and focal length [px], with its axis in the middle."""
     return Camera("SIMPLE_PINHOLE", width, height, (focal, width / 2.0, height / 2.0))
 
 
 def whole_sphere(width: int, height: int) -> Camera:
-    """Return the camera of a picture that shows the whole sphere, the horizon in the middle."""
+    """Return the camera of a picture that shows the whole sphere, with the horizon in the middle."""
     params = width / (2.0 * math.pi), height / math.pi, width / 2.0, height / 2.0
     return Camera(CUT_SPHERE, width, height, params)
 
 
 def camera_of_fov(lens: str, fov_deg: float, width: int, height: int) -> Camera:
-    """Return an ideal pinhole or fisheye that shows `fov_deg` across its width; InputError if none can."""
+    """Return an ideal fisheye (`lens` "fisheye") or else a pinhole, whose width shows `fov_deg`.
+
+    Raise InputError if a pinhole can't show so much.
+    """
     if lens == "fisheye":
         focal = width / math.radians(fov_deg)
         return Camera("SIMPLE_FISHEYE", width, height, (focal, width / 2.0, height / 2.0))

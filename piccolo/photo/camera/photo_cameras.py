@@ -1,6 +1,6 @@
-"""Calibrations of single photos: a file for each in a folder, or a model that says which camera took which.
+"""Calibrations of single photos: a folder with a file for each, or a model that names each photo's camera.
 
-Models are COLMAP's cameras with its images beside, and OpenSfM's reconstruction.json.
+A model is COLMAP's cameras file with its images file beside it, or OpenSfM's reconstruction.json.
 """
 
 from dataclasses import replace
@@ -14,7 +14,7 @@ from .foreign import is_reconstruction, read_images
 
 
 def open_calibration(path: Path) -> Calibration | Path:
-    """Return the cameras in a file, as `read_calibration`; the path where `find_calibration` has to look."""
+    """Return the cameras in a file, or, for a folder or a model, its path for `find_calibration`."""
     if path.is_dir():
         return path.absolute()
     calibration = read_calibration(path)
@@ -22,27 +22,27 @@ def open_calibration(path: Path) -> Calibration | Path:
     return path.absolute() if is_model else calibration
 
 
-def find_calibration(given: Calibration | Path | None, pano: Path) -> Calibration | None:
-    """Return a photo's calibration by what `open_calibration` returned; None if a folder has no file of it.
+def find_calibration(opened: Calibration | Path | None, pano: Path) -> Calibration | None:
+    """Return a photo's calibration; `opened` is what `open_calibration` returned.
 
-    In a folder the photo NAME.jpg has NAME.camera.json or NAME.json. A model's cameras are all left to a
-    photo that it does not name.
+    In a folder the file for NAME.jpg is NAME.camera.json or NAME.json; return None if there is none. For a
+    photo that a model does not name, all cameras of the model are returned, as a choice.
     """
-    if not isinstance(given, Path):
-        return given
-    if given.is_dir():
-        files = [given / f"{pano.stem}{suffix}" for suffix in (".camera.json", ".json")]
+    if not isinstance(opened, Path):
+        return opened
+    if opened.is_dir():
+        files = [opened / f"{pano.stem}{suffix}" for suffix in (".camera.json", ".json")]
         file = next((file for file in files if file.is_file()), None)
         return None if file is None else read_calibration(file)
-    calibration, named = _read_model(given, given.stat().st_mtime_ns)
-    (mount,) = match_names(given, named, [pano], "cameras")
+    calibration, named = _read_model(opened, opened.stat().st_mtime_ns)
+    (mount,) = match_names(opened, named, [pano], "cameras")
     if mount is None:
-        return replace(calibration, path=f"{given}, whose images do not name the photo")
+        return replace(calibration, path=f"{opened}, whose images do not name the photo")
     return replace(calibration, mounts=(mount,))
 
 
 def find_images(cameras: Path) -> Path | None:
-    """Return the file that says which of some cameras took which photo: COLMAP's images, or itself."""
+    """Return the file that names each photo's camera: COLMAP's images, or OpenSfM's file itself."""
     if cameras.suffix.lower() == ".json":
         return cameras if is_reconstruction(read_json(cameras, WANTED)) else None
     names = (f"images{suffix}" for suffix in (cameras.suffix, ".bin", ".txt"))
@@ -51,7 +51,7 @@ def find_images(cameras: Path) -> Path | None:
 
 @lru_cache(2)
 def _read_model(path: Path, _changed: int) -> tuple[Calibration, list[tuple[str, Mount]]]:
-    """Return a model's cameras, and those of its photos by name."""
+    """Return a model's cameras, and pairs of a photo's name and camera; `_changed` is for the cache."""
     images = find_images(path) or path
     with naming(images, WANTED):
         if images == path:

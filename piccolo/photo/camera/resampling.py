@@ -1,7 +1,7 @@
-"""Pictures of any cameras resampled to the sphere that everything else works on: W = 2 H, and what it shows.
+"""Pictures of any cameras resampled to a sphere, W = 2 H, and a mask of what they show.
 
-A pixel of the sphere is the mean of as many samples as keep one from the next by a pixel of the picture or
-less, so that nothing aliases; it is valid if all of them are in the picture and valid there.
+A pixel of the sphere is the mean of samples that are at most a pixel of the picture apart, so that nothing
+aliases. It is valid if all of these are in the picture and valid there.
 """
 
 import math
@@ -16,42 +16,42 @@ from ...system.arrays import Array, Bytes, Floats, Mask
 from .calibration import Mount
 from .model import PARTIAL_SPHERE, SPHERE
 
-MAX_RESAMPLED_WIDTH = 4096  # [px] nothing looks at more
+MAX_RESAMPLED_WIDTH = 4096  # [px] of the sphere; nothing needs more
 MIN_SPHERE_WIDTH = 256  # [px]
-ROWS = 64  # of the sphere, resampled at a time; divides its size
-COLUMNS = 128  # as well
-BLOCK_CELL = (
-    4  # [px] within a block in the picture, places are found so far apart and linear between: to 0.05 px
-)
-LOOK = 8  # [px] every so many it is seen first which blocks a camera shows
-MAX_SAMPLES_A_PIXEL = 8  # a pixel, across and down
-AS_FINE = 0.8  # a picture is not made smaller by a factor nearer to 1: that would blur it
-MAX_REMAP_SIDE = 32_000  # [px] of what cv2.remap reads
+ROWS = 64  # [px] height of the sphere's blocks, which are resampled one by one; divides the sphere's
+COLUMNS = 128  # [px] width of these blocks; divides the sphere's
+# [px] of the sphere: in a block, positions in the picture are computed so far apart and interpolated linearly
+# between, with errors below 0.05 px
+BLOCK_CELL = 4
+LOOK = 8  # [px] of the sphere between the pixels by which it is found which blocks a camera shows
+MAX_SAMPLES_A_PIXEL = 8  # across and down
+AS_FINE = 0.8  # a picture is shrunk only by a smaller factor: one nearer to 1 would blur it
+MAX_REMAP_SIDE = 32_000  # [px] of a picture that cv2.remap can read
 
 Pixels = tuple[Bytes, Mask]  # rgb (H, W, 3), is_valid (H, W)
 
 
 class CameraView(NamedTuple):
-    """One camera with what it has taken."""
+    """One camera with its picture."""
 
     mount: Mount
     pixels: Bytes  # (H, W, 4): RGB and 255 where valid, at any size of the camera's shape
 
 
 def sphere_width(mounts: Sequence[Mount]) -> int:
-    """Width [px] of the sphere that keeps the cameras' resolution at their axes, bounded."""
+    """Return the width [px] of the sphere that keeps the cameras' resolution at their axes, within limits."""
     finest = max(mount.camera.resolution for mount in mounts) * 2.0 * math.pi
     width = MIN_SPHERE_WIDTH * math.ceil(finest / MIN_SPHERE_WIDTH - 1e-6)
     return min(max(width, MIN_SPHERE_WIDTH), MAX_RESAMPLED_WIDTH)
 
 
 def make_sphere(views: Sequence[CameraView], width: int) -> Pixels:
-    """Return the picture of the sphere, `width` x width / 2, a multiple of MIN_SPHERE_WIDTH.
+    """Return the picture of the sphere, `width` x width / 2; `width` is a multiple of MIN_SPHERE_WIDTH.
 
-    Where several cameras show the same, the one is taken whose axis is nearest; how far they are from each
-    other is left aside.
+    Where several cameras show the same, the pixel is from the camera whose axis is nearest. Distances between
+    the cameras are neglected.
     """
-    rgb = np.zeros((width // 2, width, 3), np.uint8)  # what is not written mostly takes no memory
+    rgb = np.zeros((width // 2, width, 3), np.uint8)  # memory that is never written is mostly not allocated
     is_shown = np.zeros((width // 2, width), np.bool_)
     nearest = np.full((width // 2, width), -2.0, np.float32)  # cosine of the angle to the axis
     for view in (shrunk(view, width) for view in views):
@@ -71,7 +71,7 @@ def make_sphere(views: Sequence[CameraView], width: int) -> Pixels:
 
 
 def shrunk(view: CameraView, width: int = MAX_RESAMPLED_WIDTH) -> CameraView:
-    """Return the same area-averaged, if it is clearly finer at the axis than a sphere, or too large."""
+    """Return a view, its picture shrunk if it is clearly finer than a sphere of a width, or too large."""
     camera = view.mount.camera
     largest = MAX_REMAP_SIDE / max(camera.width, camera.height)
     factor = min(1.0, width / (2.0 * math.pi * camera.resolution), largest)
@@ -82,7 +82,7 @@ def shrunk(view: CameraView, width: int = MAX_RESAMPLED_WIDTH) -> CameraView:
 
 
 def _blocks(view: CameraView, width: int) -> list[tuple[int, int]]:
-    """Upper left corners of the sphere's blocks in which the camera may show something."""
+    """Return the upper left corners (row, column) of the sphere's blocks that the camera may show."""
     u = np.arange(LOOK // 2, width, LOOK) + 0.5
     v = np.arange(LOOK // 2, width // 2, LOOK) + 0.5
     _, is_in = view.mount.camera.pixels(compute_rays(u, v[:, None], width) @ view.mount.rotation.T)
@@ -95,12 +95,12 @@ def _blocks(view: CameraView, width: int) -> list[tuple[int, int]]:
 
 
 def _resample_block(view: CameraView, width: int, top: int, left: int) -> Pixels:
-    """Colours and validity of a block of the sphere's pixels."""
+    """Return colours and validity of a block of the sphere's pixels."""
     u = left + np.arange(0.0, COLUMNS + 1, BLOCK_CELL)
     v = top + np.arange(0.0, ROWS + 1, BLOCK_CELL)
     places, is_in = _places(view, width, u, v)
     num = _num_samples(places, is_in)
-    if is_in.all() and view.mount.camera.lens not in (SPHERE, PARTIAL_SPHERE):  # their seams are no place
+    if is_in.all() and view.mount.camera.lens not in (SPHERE, PARTIAL_SPHERE):  # their seams can't be crossed
         places = _interpolate_between(
             _interpolate_between(places, num * BLOCK_CELL).swapaxes(0, 1), num * BLOCK_CELL
         ).swapaxes(0, 1)
@@ -116,14 +116,17 @@ def _resample_block(view: CameraView, width: int, top: int, left: int) -> Pixels
 
 
 def _interpolate_between(values: Array, count: int) -> Array:
-    """Values (rows * count, ...) amid `count` equal steps from each of (rows + 1, ...) to the next."""
+    """Interpolate between consecutive rows of values (rows + 1, ...): return (rows * count, ...).
+
+    The results are in the middles of `count` equal steps from each row to the next.
+    """
     step = ((np.arange(count) + 0.5) / count).reshape(-1, *[1] * (values.ndim - 1))
-    found = values[:-1, None] + step * (values[1:] - values[:-1])[:, None]
-    return np.asarray(found.reshape(-1, *values.shape[1:]))
+    between = values[:-1, None] + step * (values[1:] - values[:-1])[:, None]
+    return np.asarray(between.reshape(-1, *values.shape[1:]))
 
 
 def _places(view: CameraView, width: int, u: Floats, v: Floats) -> tuple[Array, Mask]:
-    """Pixels (h, w, 2) of the picture at columns u (w,), rows v (h,) of the sphere, and which are in it."""
+    """Return the picture's pixels (h, w, 2) at columns (w,) and rows (h,) of the sphere, and which exist."""
     camera = view.mount.camera
     places, is_in = camera.pixels(compute_rays(u, v[:, None], width) @ view.mount.rotation.T)
     height_here, width_here = view.pixels.shape[:2]
@@ -131,7 +134,7 @@ def _places(view: CameraView, width: int, u: Floats, v: Floats) -> tuple[Array, 
 
 
 def _num_samples(places: Array, is_in: Mask) -> int:
-    """Return the number of samples a pixel needs in each direction, for the largest step between cells."""
+    """Return how many samples a pixel needs in each direction, by the largest step between cells."""
     across = np.linalg.norm(np.diff(places, axis=1), axis=2)[is_in[:, 1:] & is_in[:, :-1]]
     down = np.linalg.norm(np.diff(places, axis=0), axis=2)[is_in[1:] & is_in[:-1]]
     largest = max(across.max(initial=1.0), down.max(initial=1.0)) / BLOCK_CELL

@@ -1,4 +1,4 @@
-"""Panoramas read from files of any format and shape, always as full spheres; masks and sizes."""
+"""Panoramas read from pictures of any format and shape, always as full spheres, with masks."""
 
 from .panorama import GPano, Panorama
 from .read import panorama_size, read_panorama

@@ -1,4 +1,4 @@
-"""Cameras of a picture, by the options or, for a plain photo, by EXIF; and the part that each shows."""
+"""The cameras of a picture, by options or, for a plain photo, by EXIF; and the part of each."""
 
 import math
 from dataclasses import replace
@@ -21,19 +21,19 @@ from .gpano import ASPECT_TOLERANCE
 from .masks import black_borders
 from .picture import Picture
 
-# By EXIF's orientation: the stored picture's axes from those of the picture as it is shown; and how many
-# quarter turns to the left take it back to the stored one.
+# By EXIF's orientation: the rotation from the axes of the upright picture to those of the stored one, and the
+# number of quarter turns to the left that turn the upright picture into the stored one.
 TURNED: dict[object, tuple[Array, int]] = {
     6: (np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), 1),
     8: (np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), -1),
 }
 HOW = "; `camera`, `focal_px`, or `fov_deg` with `projection` pinhole set it exactly"
-LONGEST = 2.5  # times as long as high is no photo, but a panorama that a phone has swept
+LONGEST = 2.5  # a picture that is longer, relative to its height, is not a photo but a phone's sweep panorama
 LONG = "no photo is that long: `projection` cylindrical and `fov_deg` tell of a phone's sweep panorama"
 AS_SPHERE = "read as a full sphere, as it is 2:1; if it is a photo, add `projection` pinhole: it has "
 GUESS = "`refine_focal` needs EXIF, `focal_px`, `camera`, or `projection` pinhole and `fov_deg`"
-MIN_REPORTED_BORDER = 0.01  # of a picture: black borders below this are masked without a warning
-# deviations of a focal length's logarithm: of a guess, a number of pixels, a calibration, a field of view
+MIN_REPORTED_BORDER = 0.01  # of a picture: smaller black borders are masked without a warning
+# standard deviations of a focal length's logarithm: of a guess, in pixels, by calibration, by field of view
 OF_GUESS = 0.2
 OF_PIXELS = 0.01
 OF_CALIBRATION = 0.003
@@ -43,31 +43,32 @@ OF_FIELD = 0.03
 class Cameras(NamedTuple):
     """The cameras of a picture."""
 
-    mounts: tuple[Mount, ...] = ()  # none if it is a sphere or a part of one
-    deviation: float = 0.0  # standard deviation of the logarithm of the focal length of one camera
-    source: str = ""  # the option that gives it, or EXIF
-    notes: tuple[str, ...] = ()  # what the user should know
+    mounts: tuple[Mount, ...] = ()  # empty if it is a sphere or a part of one
+    deviation: float = 0.0  # of one camera: standard deviation of its focal length's logarithm
+    source: str = ""  # of the focal length: an option, or EXIF
+    notes: tuple[str, ...] = ()  # for the user, one line each
 
 
 def cameras_of(photo: Photo, picture: Picture, has_gpano: bool) -> Cameras:
     """Return the cameras of a picture, by the options or by EXIF.
 
-    Raises InputError if a calibration does not fit, or a pinhole is asked for and its field is unknown.
+    Raise InputError if a calibration does not fit the picture, or if the option `projection` is pinhole and
+    the focal length is unknown.
     """
-    found = _cameras_of(photo, picture, has_gpano)
+    cameras = _cameras_of(photo, picture, has_gpano)
     if not photo.refine_focal:
-        return found
-    if len(found.mounts) != 1:
-        what = f"{len(found.mounts)} cameras" if found.mounts else "a sphere or a part of one"
+        return cameras
+    if len(cameras.mounts) != 1:
+        what = f"{len(cameras.mounts)} cameras" if cameras.mounts else "a sphere or a part of one"
         raise InputError(f"{photo.path}: found {what}, wanted the photo of one camera: {GUESS}")
-    return found._replace(deviation=OF_GUESS)
+    return cameras._replace(deviation=OF_GUESS)
 
 
 def _cameras_of(photo: Photo, picture: Picture, has_gpano: bool) -> Cameras:
     width, height = picture.size
     if (calibration := find_calibration(photo.calibration, photo.path)) is not None:
         mounts = _calibrate(photo.path, picture, calibration)
-        # one camera that takes the whole sphere as it is stored here
+        # a single camera whose picture is a whole sphere needs no resampling
         is_sphere = mounts == (Mount(mounts[0].camera),) and mounts[0].camera.lens == SPHERE
         return Cameras() if is_sphere else Cameras(mounts, OF_CALIBRATION, "`camera`")
     if photo.focal_px is not None:
@@ -82,22 +83,22 @@ def _cameras_of(photo: Photo, picture: Picture, has_gpano: bool) -> Cameras:
     is_photo = lens is None and photo.fov_deg is None and not has_gpano
     if not (is_photo or lens == "pinhole"):
         return Cameras()
-    found = read_focal_length(picture.exif, picture.size)
-    if found is None and lens == "pinhole":
+    by_exif = read_focal_length(picture.exif, picture.size)
+    if by_exif is None and lens == "pinhole":
         raise InputError(
             f"{photo.path}: found no focal length in EXIF, wanted `focal_px`, `fov_deg` or `camera`"
         )
-    if found is None or (is_two_to_one and lens is None):
-        return Cameras(notes=(f"{AS_SPHERE}{found.source}",) if found else ())
-    fov = 2.0 * math.degrees(math.atan(width / 2.0 / found.focal))
-    focal = f"focal length {found.focal:.0f} px from {found.source}"
+    if by_exif is None or (is_two_to_one and lens is None):
+        return Cameras(notes=(f"{AS_SPHERE}{by_exif.source}",) if by_exif else ())
+    fov = 2.0 * math.degrees(math.atan(width / 2.0 / by_exif.focal))
+    focal = f"focal length {by_exif.focal:.0f} px from {by_exif.source}"
     note = f"read as a pinhole photo {fov:.1f} deg wide, {focal}"
     notes = (note + HOW, LONG) if max(picture.size) > LONGEST * min(picture.size) else (note + HOW,)
-    return Cameras((Mount(pinhole(width, height, found.focal)),), found.deviation, "EXIF", notes)
+    return Cameras((Mount(pinhole(width, height, by_exif.focal)),), by_exif.deviation, "EXIF", notes)
 
 
 def _calibrate(path: Path, picture: Picture, calibration: Calibration) -> tuple[Mount, ...]:
-    """Return the calibration at the picture's size, or turned to it if it fits the picture as stored."""
+    """Return the calibration at the picture's size; turn it by EXIF if it fits the picture as stored."""
     width, height = picture.size
     try:
         return calibration.for_picture(width, height)
@@ -115,9 +116,9 @@ def _calibrate(path: Path, picture: Picture, calibration: Calibration) -> tuple[
 def read_views(
     path: Path, picture: Picture, mounts: tuple[Mount, ...], is_valid: Mask
 ) -> tuple[list[CameraView], tuple[str, ...]]:
-    """Return each camera with its part of a picture, black borders masked, and notes for the user.
+    """Return each camera with its part of a picture, with black borders masked, and notes for the user.
 
-    `is_valid` (H, W) are the pixels that count so far.
+    `is_valid` (H, W) is the mask of the pixels that are valid so far.
     """
     pixels = face_pixels(picture.rgb, is_valid)
     whole = compute_extent(mounts)
@@ -129,7 +130,7 @@ def read_views(
         left, top = mount.offset
         camera = mount.camera
         own = np.ascontiguousarray(pixels[top : top + camera.height, left : left + camera.width])
-        is_bounded = camera.max_angle_deg is not None  # what is black within the circle is no border
+        is_bounded = camera.max_angle_deg is not None  # black within a fisheye's circle is no border
         borders = None if is_bounded else black_borders(own[..., :3], own[..., 3] > 0, is_full=False)
         if borders is not None:
             own[borders] = 0
@@ -140,8 +141,8 @@ def read_views(
 
 
 def rig_cameras(path: Path, pictures: list[Picture], rig: Calibration) -> list[tuple[Mount, ...]]:
-    """Return the camera of each picture of a rig, at the picture's size; InputError for another shape."""
-    found = []
+    """Return the cameras of each picture of a rig, at the picture's size. InputError for another shape."""
+    cameras = []
     for picture, mount in zip(pictures, rig.mounts, strict=True):
         width, height = picture.size
         if rig.has_sizes:
@@ -150,5 +151,5 @@ def rig_cameras(path: Path, pictures: list[Picture], rig: Calibration) -> list[t
         else:
             camera = mount.camera
             mounts = (mount.with_camera(Camera(camera.model, width, height, camera.params)),)
-        found.append(mounts)
-    return found
+        cameras.append(mounts)
+    return cameras

@@ -1,10 +1,10 @@
-"""Six faces of a cube, files of a folder or cells of one picture, resampled to an equirectangular picture.
+"""Six faces of a cube, in files of a folder or cells of one picture, resampled to an equirectangular picture.
 
-Every face is a pinhole picture of 90 x 90 degrees seen from inside. The lower edge of up is the upper edge of
-front, the upper edge of down the lower edge of front, as in OpenGL's cube (px right, nx left, py up, ny down,
-pz front, nz back), Matterport's skybox and FFmpeg's v360.
+Every face is a pinhole picture of 90 x 90 degrees seen from inside. The lower edge of "up" is the upper edge
+of "front", and the upper edge of "down" is the lower edge of "front", as in OpenGL's cube (px right, nx left,
+py up, ny down, pz front, nz back), Matterport's skybox and FFmpeg's v360.
 
-py360convert 1.0.4 is not used: it samples half a pixel off, leaves the rim's pixels in a face's corners
+py360convert 1.0.4 is not used: it samples half a pixel off, leaves pixels of the rim at a face's corners
 uninitialised, and takes four times the memory.
 """
 
@@ -36,10 +36,10 @@ R_FACE_FROM_CAM = {
     }.items()
 }
 Faces = dict[str, Bytes]  # by letter, (size, size, 4): RGB and 255 where valid
-MIN_FACE = 32  # [px]
-MAX_FACE = MAX_PICTURE_WIDTH // 4
+MIN_FACE = 32  # [px] side of a face
+MAX_FACE = MAX_PICTURE_WIDTH // 4  # [px]
 MAX_CUBE_FILES = 64  # a folder with more pictures is a folder of panoramas
-MAX_EMPTY_RANGE = 8  # levels within an empty cell of a cross: JPEG leaves a few
+MAX_EMPTY_RANGE = 8  # [levels] in an empty cell of a cross: JPEG changes colours by a few
 # names that programs give to the faces r, l, u, d, f, b
 SCHEMES = (
     ("skybox2", "skybox4", "skybox0", "skybox5", "skybox1", "skybox3"),  # Matterport
@@ -49,13 +49,13 @@ SCHEMES = (
     ("right", "left", "top", "bottom", "front", "back"),
     ("r", "l", "u", "d", "f", "b"),
 )
-# letters of the cells of a cross; B is back turned by half a turn
+# letters of the cells of a cross; B is the back face upside down
 CROSSES = (("-u--", "lfrb", "-d--"), ("-u-", "lfr", "-d-", "-B-"))
 WANTED = "wanted six faces of a cube named as skybox0..5, px nx py ny pz nz or right left up down front back"
 
 
 def face_pixels(rgb: Bytes, is_valid: Mask) -> Bytes:
-    """Return a face (size, size, 4) with its validity as alpha, to be resampled."""
+    """Return a picture (H, W, 4) with its validity as alpha, ready to be resampled."""
     return np.dstack([rgb, is_valid.astype(np.uint8) * 255])
 
 
@@ -71,7 +71,7 @@ def equirectangular(faces: Faces) -> Pixels:
     for top in range(0, 2 * size, ROWS_AT_ONCE):
         rows = slice(top, top + ROWS_AT_ONCE)
         rays = pixel_rays(4 * size, rows).astype(np.float32)
-        for left in range(0, 4 * size, size // 2):  # half a face: one face around, and up or down
+        for left in range(0, 4 * size, size // 2):  # half a face: it meets one face to the side
             columns = slice(left, left + size // 2)
             pixels = _sample_faces(padded, rays[:, columns], rim=1)
             rgb[rows, columns] = pixels[..., :3]
@@ -80,7 +80,7 @@ def equirectangular(faces: Faces) -> Pixels:
 
 
 def _pad_face(faces: Faces, letter: str) -> Bytes:
-    """Return a face with a rim of one pixel from the faces around it, for interpolation across the edge."""
+    """Return a face with a rim of one pixel of its neighbours around it, to interpolate across its edges."""
     size = len(faces[letter])
     padded = cv2.copyMakeBorder(faces[letter], 1, 1, 1, 1, cv2.BORDER_CONSTANT)
     ends = np.array([0, size + 1])
@@ -94,22 +94,22 @@ def _pad_face(faces: Faces, letter: str) -> Bytes:
 
 
 def _sample_faces(faces: Faces, directions: Array32, rim: int) -> Bytes:
-    """Sample pixels (H, W, 4) along directions (H, W, 3), each from its face, with a rim of `rim` pixels."""
+    """Sample the pixels (H, W, 4) in directions (H, W, 3); faces have a rim of `rim` pixels around them."""
     pixels = np.empty((*directions.shape[:2], 4), dtype=np.uint8)
     largest = np.abs(directions).max(axis=2)
     for letter, R in R_FACE_FROM_CAM.items():
         right, down, depth = np.moveaxis(directions @ R.T, 2, 0)
-        is_met = depth == largest  # on an edge two faces are, and either will do
+        is_met = depth == largest  # on an edge two faces are met: either is right
         if is_met.any():
             half = len(faces[letter]) / 2.0 - rim
             u, v = ((x / largest + 1.0) * half - 0.5 + rim for x in (right, down))
-            found = cv2.remap(faces[letter], u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            pixels[is_met] = found[is_met]
+            in_face = cv2.remap(faces[letter], u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            pixels[is_met] = in_face[is_met]
     return pixels
 
 
 def read_cube_folder(folder: Path) -> Picture:
-    """Return the panorama of a folder's one cube of six equal squares; InputError if it holds none."""
+    """Return the panorama of the one cube in a folder. Raise InputError without six equal squares."""
     paths = face_paths(folder).items()
     pictures = {letter: read_picture(path, (MIN_FACE, MIN_FACE)) for letter, path in paths}
     faces = {letter: face_pixels(picture.rgb, picture.is_valid) for letter, picture in pictures.items()}
@@ -118,7 +118,7 @@ def read_cube_folder(folder: Path) -> Picture:
 
 
 def is_cube(folder: Path) -> bool:
-    """Return True if a folder holds few pictures, and among them the six faces of one cube."""
+    """Return True if a folder has few pictures, among them the six faces of exactly one cube."""
     if sum(path.suffix.lower() in PICTURES for path in folder.iterdir()) > MAX_CUBE_FILES:
         return False
     try:
@@ -128,7 +128,10 @@ def is_cube(folder: Path) -> bool:
 
 
 def face_paths(folder: Path) -> dict[str, Path]:
-    """Return a folder's one complete cube, by letters of faces; the rest of its files' names is the same."""
+    """Return the files of the one complete cube in a folder, by the letters of the faces.
+
+    Apart from the faces' names, the names of these files are equal. Raise InputError for none or several.
+    """
     try:
         files = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
     except OSError as error:
@@ -149,12 +152,12 @@ def face_paths(folder: Path) -> dict[str, Path]:
 
 
 def cube_of_cells(path: Path, picture: Picture, order: str | None) -> Picture | None:
-    """Return the panorama of a picture that is a cross, or by `order` a grid, of six faces; else None.
+    """Return the panorama of a picture that is a cross or a grid of six faces; else None.
 
     A cross, 4:3 or 3:4, is recognised by its empty cells. A grid, 6:1, 1:6, 3:2 or 2:3, needs `order`: the
     letters of its faces from left to right, then downwards.
 
-    Raises InputError if an order is given, and the picture is no grid of six squares.
+    Raise InputError if an order is given, but the picture is not a grid of six squares.
     """
     if order is not None:
         return _from_faces(path, _grid(path, picture, order), picture.warnings)
@@ -175,7 +178,7 @@ def _grid(path: Path, picture: Picture, order: str) -> Faces:
 
 
 def _cross(picture: Picture, layout: tuple[str, ...]) -> Faces | None:
-    """Return the faces of a cross; None for another shape, or if the cells around it are not empty."""
+    """Return the faces of a cross; None for another shape, or if its other cells are not empty."""
     width, height = picture.size
     size = width // len(layout[0])
     if width != size * len(layout[0]) or height != size * len(layout):
@@ -198,7 +201,7 @@ def _cell(picture: Picture, size: int, row: int, column: int) -> Bytes:
 
 
 def _is_empty(pixels: Bytes) -> bool:
-    """Return True for a cell that but for a thin rim, as neighbours show there, has one colour or alpha 0."""
+    """Return True if a cell has one colour or alpha 0, except in a thin rim, where neighbours may show."""
     rim = max(len(pixels) // 32, 1)
     inner = pixels[rim:-rim, rim:-rim].reshape(-1, 4)
     is_constant = (inner.max(axis=0).astype(int) - inner.min(axis=0)).max() <= MAX_EMPTY_RANGE

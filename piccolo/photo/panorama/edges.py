@@ -1,7 +1,7 @@
-"""Edges of a photo, as `cloud.surfaces` paints those of a scan without colours, and the axes of most of them.
+"""Edges of a photo, painted as `cloud.surfaces` paints those of a scan without colours; and their main axes.
 
-A line's gradients are at right angles to it, wherever it is seen: an axis is the direction at right angles to
-most gradients (Coughlan and Yuille, "Manhattan World", ICCV 1999).
+The gradients along a straight line are at right angles to it, wherever it is seen. So an axis is a direction
+at right angles to most gradients (Coughlan and Yuille, "Manhattan World", ICCV 1999).
 """
 
 from dataclasses import replace
@@ -18,34 +18,34 @@ from ...system.arrays import Array, Array32, Mask
 from .panorama import Panorama, resize
 
 GRADIENT_WIDTH = 1024  # [px] of the sphere on which gradients are taken
-DARK = 12.0  # [levels] added before the logarithm
-SMOOTHING = 0.8  # [px] before the gradient is taken
-FULL_GRADIENT = 0.25  # of the logarithm, a pixel; the strength is the root of the fraction
-COS_UPRIGHT_EDGE = (
-    0.9,
-    0.98,
-)  # cosine of a gradient's angle to the horizontal: no vertical edge at all, and fully
-SPREAD = 1.0  # [px] the painted edges of a scan are wide
-LEAST_COS = 0.2  # of the elevation: nearer to the poles a pixel counts as this wide
-SEAM_MARGIN = 32  # [px] beyond the seam
+DARK = 12.0  # [levels] added to the grey before the logarithm
+SMOOTHING = 0.8  # [px] standard deviation of the blur before the gradient
+# gradient of the logarithm, per pixel, of an edge of strength 1; of a weaker one the strength is the root
+FULL_GRADIENT = 0.25
+# cosine of a gradient's angle to the horizontal, for an edge that is not vertical at all, and fully vertical
+COS_UPRIGHT_EDGE = (0.9, 0.98)
+SPREAD = 1.0  # [px] standard deviation of a blur that makes edges as wide as the painted ones of a scan
+LEAST_COS = 0.2  # of the elevation: nearer to the poles a pixel counts as wide as here
+SEAM_MARGIN = 32  # [px] that are added on all sides, across the seam
 
 Pixel = TypeVar("Pixel", np.uint8, np.float32)
 AXES_WIDTH = 512  # [px] of the sphere on which axes are found
-FLAT_SHARE = 0.85  # of the pixels, with the weakest gradients: no edges
-LEAST_EDGE = 1e-4  # of the gradient of the logarithm
-LEAST_EDGES = 100  # [px] fewer say nothing
-LEAST_VOTING_COS = 0.35  # of the elevation: nearer to the poles gradients are rough
-NUM_RINGS = 60  # of the grid of directions that are tried: 3 degrees apart
-COS_ACROSS = (
-    0.035  # cosine of the angle between an axis and a gradient that is at right angles to it, at most
-)
-VOTERS = 4  # one of so many edges votes
-SHARPENINGS = 4
-SQUARE = 0.1  # cosine of the angle between two axes, at most
+FLAT_SHARE = 0.85  # of the pixels, those with the weakest gradients, are not edges
+LEAST_EDGE = 1e-4  # least gradient of the logarithm at an edge
+LEAST_EDGES = 100  # [px] with fewer pixels on edges there are no axes
+LEAST_VOTING_COS = 0.35  # of the elevation: nearer to the poles gradients are inexact and not used
+NUM_RINGS = 60  # of the grid of directions that are tried as axes: 3 degrees apart
+COS_ACROSS = 0.035  # largest cosine between an axis and a gradient at right angles to it
+VOTERS = 4  # one of so many edge pixels votes
+SHARPENINGS = 4  # iterations of least squares
+SQUARE = 0.1  # largest cosine between two axes
 
 
 def draw_edges(panorama: Panorama, R_cam_from_level: Array, has_gray: bool) -> Panorama:
-    """Return a panorama of another's edges, with its grey or without, for a known tilt (3, 3)."""
+    """Return a panorama with the edges of another in its channels, with or without its grey.
+
+    The rotation (3, 3) from level axes to the camera's tells which edges are vertical.
+    """
     source = resize(panorama, GRADIENT_WIDTH)
     across, down = gradients(source)
     strength = np.hypot(across, down)
@@ -57,10 +57,10 @@ def draw_edges(panorama: Panorama, R_cam_from_level: Array, has_gray: bool) -> P
         (cosine - COS_UPRIGHT_EDGE[0]) / (COS_UPRIGHT_EDGE[1] - COS_UPRIGHT_EDGE[0]), 0.0, 1.0
     )
     gray = mean_level(source) / np.float32(255.0) if has_gray else 0.5
-    shown = find_inner(source).astype(np.float32)
-    weight = np.maximum(blur(shown, SPREAD), 1e-6)
-    strength = blur(strength * shown, SPREAD) / weight
-    vertical = blur(vertical * shown, SPREAD) / weight
+    inner = find_inner(source).astype(np.float32)
+    weight = np.maximum(blur(inner, SPREAD), 1e-6)
+    strength = blur(strength * inner, SPREAD) / weight
+    vertical = blur(vertical * inner, SPREAD) / weight
     return Panorama(colors_of_edges(strength, vertical, gray), source.is_valid)
 
 
@@ -70,7 +70,7 @@ def soften(panorama: Panorama, sigma: float) -> Panorama:
 
 
 def gradients(panorama: Panorama) -> tuple[Array32, Array32]:
-    """Return the derivatives (H, W) of the grey's logarithm, right and down, by pixels of the equator."""
+    """Return the derivatives (H, W) of the grey's logarithm, right and down, per pixel of the equator."""
     gray = np.log(mean_level(panorama) + np.float32(DARK))
     smooth = cv2.GaussianBlur(wrap(gray), (0, 0), SMOOTHING)
     inner = slice(SEAM_MARGIN, -SEAM_MARGIN)
@@ -92,13 +92,13 @@ def row_cosines(height: int) -> Array:
 
 
 def find_inner(panorama: Panorama) -> Mask:
-    """Return the mask (H, W) of the pixels whose gradient no masked pixel touches."""
+    """Return the mask (H, W) of the pixels whose gradients depend on no masked pixel."""
     return np.asarray(cv2.erode(panorama.is_valid.view(np.uint8), np.ones((5, 5), np.uint8)) > 0)
 
 
 @lru_cache(maxsize=2)
 def tangent_axes(width: int) -> tuple[Array, Array]:
-    """Return the unit directions (H, W, 3), across to the right and down, at each pixel."""
+    """Return the unit directions (H, W, 3) to the right, and down, along the image at each pixel."""
     x, y, z = np.moveaxis(pixel_rays(width), -1, 0)
     rho = np.maximum(np.hypot(x, y), 1e-9)
     right = np.stack([y / rho, -x / rho, np.zeros_like(x)], axis=-1)
@@ -106,10 +106,10 @@ def tangent_axes(width: int) -> tuple[Array, Array]:
 
 
 def level_directions(width: int, R_cam_from_level: Array) -> tuple[Array, Array]:
-    """Return the parts (H, W), across and down the image, of the unit level direction at each pixel."""
+    """Return the components (H, W), right and down the image, of the level direction at each pixel."""
     right, below = tangent_axes(width)
     up_cam = R_cam_from_level[:, 2]
-    across = np.einsum("hwi,i->hw", below, up_cam)  # of up x ray, with ray x right = below
+    across = np.einsum("hwi,i->hw", below, up_cam)  # the level direction is up x ray, and ray x right = below
     down = -np.einsum("hwi,i->hw", right, up_cam)
     length = np.maximum(np.hypot(across, down), 1e-9)
     return across / length, down / length
@@ -124,7 +124,7 @@ def blur(image: NDArray[Pixel], sigma: float) -> NDArray[Pixel]:
 
 
 def wrap(image: NDArray[Pixel]) -> NDArray[Pixel]:
-    """Return an equirectangular image (H, W, ...) with a margin on all sides, across the seam."""
+    """Return an equirectangular image (H, W, ...) with a margin on all sides, continued across the seam."""
     wide = np.concatenate([image[:, -SEAM_MARGIN:], image, image[:, :SEAM_MARGIN]], axis=1)
     return cast(
         NDArray[Pixel], cv2.copyMakeBorder(wide, SEAM_MARGIN, SEAM_MARGIN, 0, 0, cv2.BORDER_REPLICATE)
@@ -132,7 +132,7 @@ def wrap(image: NDArray[Pixel]) -> NDArray[Pixel]:
 
 
 def find_axes(panorama: Panorama) -> list[Array]:
-    """Return unit vectors (3,) along three directions, both ways, nearest to +z first; none without edges."""
+    """Return unit vectors (3,) along three main axes, both ways, nearest to +z first; none without edges."""
     normals, weights = edge_normals(panorama)
     if len(normals) < LEAST_EDGES:
         return []
@@ -150,7 +150,7 @@ def find_axes(panorama: Panorama) -> list[Array]:
 
 
 def edge_normals(panorama: Panorama) -> tuple[Array, Array]:
-    """Return unit gradients (N, 3), in the camera's axes, at a photo's edges, and their solid angles (N,)."""
+    """Return unit gradients (N, 3) at a photo's edges, in camera axes, and relative solid angles (N,)."""
     source = resize(panorama, AXES_WIDTH)
     across, along = gradients(source)
     right, down = tangent_axes(AXES_WIDTH)
@@ -166,7 +166,7 @@ def edge_normals(panorama: Panorama) -> tuple[Array, Array]:
 
 
 def sharpen_axis(normals: Array, weights: Array, axis: Array) -> Array:
-    """Return the axis (3,) at right angles to the normals (N, 3) that nearly are, by least squares."""
+    """Refine an axis (3,) by least squares on those normals (N, 3) that are nearly at right angles to it."""
     for _ in range(SHARPENINGS):
         near = np.abs(normals @ axis) < COS_ACROSS
         moments = (normals[near] * weights[near, None]).T @ normals[near]

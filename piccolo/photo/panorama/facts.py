@@ -1,10 +1,10 @@
 """Facts in a photo's file besides its pixels: digest, size, time, place, focal length, elevation.
 
-Damaged fields count as missing. The focal length in pixels is the more exact of two:
+Damaged fields count as missing. The focal length in pixels is by the first of these that is plausible:
 - FocalLength with FocalPlaneXResolution and its unit, at the size at which the picture was taken;
 - FocalLengthIn35mmFilm, the focal length that shows the same angle over the diagonal of 36 x 24 mm, 43.27 mm,
-  as CIPA DCG-001 defines it: a phone's 4:3 picture is compared with film of 3:2, so widths can't be. Of a
-  picture of another shape, as 16:9, some cameras mean its own diagonal, others that of the whole sensor.
+  as CIPA DCG-001 defines it. Diagonals are compared, as a phone's 4:3 picture is not as wide as film of 3:2.
+  For a picture of another shape, such as 16:9, some cameras use its own diagonal, others the whole sensor's.
 """
 
 import hashlib
@@ -34,34 +34,35 @@ TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)")
 OFFSET = re.compile(r"[+-]\d\d:\d\d")
 DEGREE_PARTS = 1.0, 60.0, 3600.0  # degrees, minutes, seconds
 FILM_DIAGONAL = math.hypot(36.0, 24.0)  # [mm]
-MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of FocalPlaneResolutionUnit; 2 where it is missing
-MIN_FILM, MAX_FILM = 8.0, 800.0  # [mm] what is wider is no photo by a plain lens
-BREATHING = 0.01  # of a focal length: what focusing changes
-ZOOMING = 0.03  # what a zoom rounds
-SENSOR_SHAPES = 4 / 3, 3 / 2
-MAX_DISAGREEMENT = 0.25  # of the two: one of them is of the picture before it was cropped
+MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # by FocalPlaneResolutionUnit, which is 2 if missing
+MIN_FILM, MAX_FILM = 8.0, 800.0  # [mm] on film: other focal lengths are not of a plain lens
+BREATHING = 0.01  # relative error of a focal length by focusing
+ZOOMING = 0.03  # the same of a zoom lens, whose focal length is rounded
+SENSOR_SHAPES = 4 / 3, 3 / 2  # usual ratios of width to height
+MAX_DISAGREEMENT = 0.25  # relative, of both focal lengths; beyond, the picture was cropped
 CAMERA_ELEVATION = 0x9405  # CameraElevationAngle of EXIF 2.31 [deg]
 
 
 class GpsPosition(NamedTuple):
-    """Position of a receiver in the camera, on the WGS 84 ellipsoid."""
+    """Position by the camera's GPS receiver, in WGS 84."""
 
     latitude_deg: float
     longitude_deg: float
-    accuracy: float | None  # [m] horizontal, None if the file does not say
+    accuracy: float | None  # [m] horizontal; None if the file does not name it
 
 
 class PhotoFacts(NamedTuple):
-    """Facts of a photo's file other than its pixels."""
+    """Facts in a photo's file besides its pixels."""
 
-    sha256: str  # of the file; of several, of their digests in the order of FACE_LETTERS or rig, one a line
-    image_size: tuple[int, int]  # width and height [px], as stored; of several the first
+    # digest of the file; for several files, of their digests, one a line, in the order of FACE_LETTERS or rig
+    sha256: str
+    image_size: tuple[int, int]  # width and height [px] as stored, of the first of several files
     capture_time: str | None  # ISO 8601, with the offset from UTC if the file has it
     gps: GpsPosition | None
 
 
 def sha256_of(path: Path, rig: Calibration | None = None) -> str | None:
-    """Return the digest of a photo's file or files, pictures or not; None if they can't be read."""
+    """Return the digest of a photo's file or files, whatever they contain; None if they can't be read."""
     try:
         return _digest(_files_of(path, rig))
     except (OSError, InputError):
@@ -80,10 +81,10 @@ def _digest(files: list[Path]) -> str:
 
 
 def read_photo_facts(photo: File | Bytes | Photo) -> PhotoFacts:
-    """Return the facts that a photo's file gives, or the first file of a folder of cube faces or of a rig.
+    """Return the facts in a photo's file, or in the first file of a folder of cube faces or of a rig.
 
-    Pixels (H, W, 3) have a digest and a size. InputError if the file is missing or no picture. Metadata that
-    are damaged count as missing.
+    For an array (H, W, 3) these are digest and size. Damaged metadata count as missing. Raise InputError if
+    the file is missing or is not a picture.
     """
     photo = as_photo(photo)
     if isinstance(photo.picture, np.ndarray):
@@ -95,32 +96,32 @@ def read_photo_facts(photo: File | Bytes | Photo) -> PhotoFacts:
         try:
             if chunk := _exif_chunk(content):
                 image.info["exif"] = chunk
-            own = Image.Image.getexif(image)  # that of PngImageFile decodes the picture to find the chunk
+            own = Image.Image.getexif(image)  # PngImageFile's own decodes the whole picture
             exif = own.get_ifd(IFD.Exif)
             gps = own.get_ifd(IFD.GPSInfo)
-        except Exception:  # Pillow raises whatever damaged metadata bring
+        except Exception:  # Pillow raises errors of many kinds for damaged metadata
             exif = {}
             gps = {}
         return PhotoFacts(_digest(files), image.size, _capture_time(exif), _gps_position(gps))
 
 
 def _exif_chunk(content: bytes) -> bytes:
-    """Return the EXIF in a PNG file, before or behind the pixels; empty without, or for another file."""
+    """Return the EXIF in a PNG file, before or after its pixels; empty without, or for another file."""
     begin = len(PNG_MAGIC) if content.startswith(PNG_MAGIC) else len(content)
     while begin + 8 <= len(content):
         end = begin + 8 + int.from_bytes(content[begin : begin + 4])
         if content[begin + 4 : begin + 8] == b"eXIf":
             return content[begin + 8 : end]
-        begin = end + 4  # behind its checksum
+        begin = end + 4  # after its checksum
     return b""
 
 
 def _capture_time(exif: Mapping[int, Any]) -> str | None:
     """Return the time at which the picture was taken, by the camera's clock; None if it is missing."""
-    found = TIME.fullmatch(str(exif.get(Base.DateTimeOriginal, "")).strip("\0 "))
-    if not found:
+    parts = TIME.fullmatch(str(exif.get(Base.DateTimeOriginal, "")).strip("\0 "))
+    if not parts:
         return None
-    year, month, day, clock = found.groups()
+    year, month, day, clock = parts.groups()
     digits = re.sub(r"\D", "", str(exif.get(Base.SubsecTimeOriginal, "")))[:6]
     offset = OFFSET.fullmatch(str(exif.get(Base.OffsetTimeOriginal, "")).strip("\0 "))
     time = f"{year}-{month}-{day}T{clock}" + (f".{digits}" if digits else "") + (offset[0] if offset else "")
@@ -155,11 +156,11 @@ class ExifFocal(NamedTuple):
 
     focal: float  # [px]
     deviation: float  # standard deviation of its logarithm
-    source: str  # in words
+    source: str  # for messages
 
 
 def read_focal_length(exif: Mapping[int, object], size: tuple[int, int]) -> ExifFocal | None:
-    """Return the focal length of a picture of this size [px]; None if it is missing or impossible."""
+    """Return the focal length by EXIF of a picture of this size [px]; None if missing or impossible."""
     diagonal = math.hypot(size[0], size[1])
     film = _number(exif, Base.FocalLengthIn35mmFilm)
     film = film if film and MIN_FILM <= film <= MAX_FILM else None
@@ -188,7 +189,10 @@ def read_focal_length(exif: Mapping[int, object], size: tuple[int, int]) -> Exif
 
 
 def _largest_diagonal(size: tuple[int, int]) -> float:
-    """Return the diagonal [px] of the largest usual sensor whose whole width or height a picture has."""
+    """Return the diagonal [px] of the largest usual sensor from which a picture may have been cut.
+
+    The picture has the sensor's whole width or height. If its shape is usual, it is the sensor's.
+    """
     longer = max(size)
     shorter = min(size)
     if any(abs(longer / shorter / shape - 1.0) <= ASPECT_TOLERANCE for shape in SENSOR_SHAPES):
@@ -198,7 +202,7 @@ def _largest_diagonal(size: tuple[int, int]) -> float:
 
 
 def _focal_by_plane(exif: Mapping[int, object], size: tuple[int, int]) -> float | None:
-    """Return the focal length [px] by the sensor's resolution; the picture may be a smaller copy."""
+    """Return the focal length [px] by the sensor's resolution, or None; the picture may be a smaller copy."""
     focal = _number(exif, Base.FocalLength)
     per_unit = _number(exif, Base.FocalPlaneXResolution)
     unit = MM_PER_UNIT.get(int(_number(exif, Base.FocalPlaneResolutionUnit) or 2))
@@ -216,7 +220,7 @@ def elevation_deg(exif: Mapping[int, object]) -> float | None:
 
 
 def _number(exif: Mapping[int, object], tag: int, least: float = 0.0) -> float | None:
-    """Return the finite number in a tag; None if it is missing, no number or less than `least`."""
+    """Return the finite number in a tag; None if it is missing, not a number, or less than `least`."""
     try:
         value = float(cast(SupportsFloat, exif[tag]))
     except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):

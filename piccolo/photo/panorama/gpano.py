@@ -1,9 +1,9 @@
 """Google's Photo Sphere XMP: the part of the sphere that a picture shows, and the camera's attitude.
 
 https://developers.google.com/streetview/spherical-metadata. The few fields are searched in the text, as
-attributes and as elements, without an XML parser: there are no entities to expand, and damaged XML costs only
-its damaged fields. Crops are embedded in the full sphere here. A pose is written into a JPEG as text too, so
-that what others wrote stays as they wrote it.
+attributes and as elements, without an XML parser: no entities are expanded, and in damaged XML only damaged
+fields are lost. Crops are embedded in the full sphere here. A pose is written into a JPEG as text too, so
+that all that other programs wrote stays as it is.
 """
 
 import math
@@ -27,12 +27,12 @@ from .picture import MAX_PICTURE_WIDTH, SPHERE_NAMESPACE as NAMESPACE, open_pict
 PREFIX = re.compile(rb"xmlns:([A-Za-z_][\w.-]{0,40})\s{0,9}=\s{0,9}[\"']" + re.escape(NAMESPACE))
 FIELD = rb"\b%s:(\w{1,60})(?:\s{0,9}=\s{0,9}[\"']([^\"'<>]{0,80})[\"']|\s{0,9}>([^<>]{0,80})</)"
 MAX_GPANO_NUMBER = 1e9
-MAX_PREFIXES = 4  # of one namespace: each is a search of its own
+MAX_PREFIXES = 4  # of the namespace that are searched
 CROP_NAMES = "CroppedAreaLeft CroppedAreaTop CroppedAreaImageWidth CroppedAreaImageHeight"
 CROP_FIELDS = tuple(f"{name}Pixels" for name in f"{CROP_NAMES} FullPanoWidth FullPanoHeight".split())
-ASPECT_TOLERANCE = 0.01
-MIN_STRIP = 2.0 * (1.0 + ASPECT_TOLERANCE)  # times as wide as high is no whole sphere
-MIN_REGION = 0.02  # of the sphere's picture: less would take much memory to show nearly nothing
+ASPECT_TOLERANCE = 0.01  # relative, of a picture's width to height
+MIN_STRIP = 2.0 * (1.0 + ASPECT_TOLERANCE)  # width to height: a wider picture is no whole sphere
+MIN_REGION = 0.02  # of the sphere's picture: smaller pictures would take much memory for little
 JPEG_MAGIC = b"\xff\xd8"
 APP0 = 0xE0
 APP1 = 0xE1
@@ -43,7 +43,7 @@ MAX_BODY_SIZE = 0xFFFF - 2
 POSE_NAMES = ("PoseHeadingDegrees", "PosePitchDegrees", "PoseRollDegrees")
 END = re.compile(rb"</([A-Za-z_][\w.-]{0,40}):RDF\s{0,9}>")
 ABOUT = re.compile(rb":about\s{0,9}=\s{0,9}(\"[^\"<]{0,999}\"|'[^'<]{0,999}')")
-# what is left of a description that had nothing but the pose
+# the rest of a description that contained nothing but the pose
 LEFTOVER = re.compile(
     rb"<[\w.-]{1,40}:Description [\w.-]{1,40}:about=(\"[^\"<]{0,999}\"|'[^'<]{0,999}') xmlns:GPano=\""
     + re.escape(NAMESPACE)
@@ -74,7 +74,7 @@ class CropRegion:
 
 
 def gpano_fields(xmp: bytes) -> dict[str, str]:
-    """Return names and texts of the Photo Sphere fields in an XMP packet, without the namespace."""
+    """Return the Photo Sphere fields in an XMP packet: texts by names without their prefix."""
     fields: dict[str, str] = {}
     for prefix in list(dict.fromkeys(PREFIX.findall(xmp)))[:MAX_PREFIXES]:
         for name, attribute, element in re.findall(FIELD % re.escape(prefix), xmp):
@@ -84,26 +84,26 @@ def gpano_fields(xmp: bytes) -> dict[str, str]:
 
 
 def _number(fields: dict[str, str], name: str, largest: float = MAX_GPANO_NUMBER) -> float | None:
-    """Return the number in a field; None if it is missing, no number, not finite or out of range."""
+    """Return the number in a field; None if it is missing, not a finite number, or out of range."""
     try:
         value = float(fields[name])
     except (KeyError, ValueError):
         return None
-    return value if abs(value) <= largest else None  # NaN is not
+    return value if abs(value) <= largest else None  # not so for NaN
 
 
 def attitude(fields: dict[str, str]) -> GPano:
-    """Return pitch and roll; a value out of range counts as missing."""
+    """Return the pitch and roll in the fields; a value out of range counts as missing."""
     return GPano(_number(fields, "PosePitchDegrees", 90.0), _number(fields, "PoseRollDegrees", 180.0))
 
 
 def crop_region(fields: dict[str, str], aspect: float) -> CropRegion | None:
     """Return the part of the sphere that a picture of `aspect` (width / height) shows.
 
-    All of it if there are no fields. These count pixels of the picture as it was made: only their ratios are
-    used, so that a picture made smaller later is placed right. Some phones give a strip's own height as that
-    of the sphere: its middle is on the horizon. None if the fields make no sense or are of a picture of
-    another shape.
+    Without fields this is the whole sphere. The fields are in pixels of the original picture; only their
+    ratios are used, so that a picture that was resized later is placed right. Some phones write a strip's own
+    height as that of the sphere: its middle is then put on the horizon. Return None if the fields make no
+    sense, or are those of a picture of another shape.
     """
     if not fields.keys() & set(CROP_FIELDS):
         return CropRegion()
@@ -115,7 +115,7 @@ def crop_region(fields: dict[str, str], aspect: float) -> CropRegion | None:
         full_height = full_width / 2.0
         top = (full_height - height) / 2.0
     is_inside = width <= full_width and -1.0 <= top <= full_height - height + 1.0 and abs(left) <= full_width
-    # a pixel more or less by rounding, or one per cent
+    # within 1.5 pixels, for rounding, or within one per cent
     is_same_shape = abs(width / height / aspect - 1.0) <= max(0.01, 1.5 / width, 1.5 / height)
     if not (is_inside and is_same_shape):
         return None
@@ -129,7 +129,7 @@ def _crop_numbers(fields: dict[str, str]) -> list[float] | None:
 
 
 def lacks_horizon(fields: dict[str, str]) -> bool:
-    """Return True if the sphere's height is said to be that of a crop, whose place is then unknown."""
+    """Return True if the fields give the crop's height as the sphere's, so that its horizon is unknown."""
     numbers = _crop_numbers(fields)
     if numbers is None:
         return False
@@ -138,7 +138,7 @@ def lacks_horizon(fields: dict[str, str]) -> bool:
 
 
 def rotation_to_level(gpano: GPano) -> Array | None:
-    """Return R_level_from_cam (3, 3) from pitch and roll; None if both are missing, else a missing one is 0.
+    """Return R_level_from_cam (3, 3) from pitch and roll; None if both are missing; one missing is 0.
 
     `x_level = R_level_from_cam @ x_cam`; both frames have +x towards the image centre, +y left, +z up, level
     with z against gravity and x at the heading. Google's reference: pitch is the image centre's elevation
@@ -164,7 +164,7 @@ def attitude_of_gravity(down_cam: tuple[float, float, float]) -> GPano:
 
 
 def region_of_fov(fov_deg: float, width: int, height: int) -> CropRegion:
-    """Return the region of a picture centred on the horizon, with equal degrees a pixel both ways."""
+    """Return the region of a picture centred on the horizon, with the same degrees per pixel both ways."""
     wide = fov_deg / 360.0  # fraction of the sphere's picture
     high = fov_deg / 180.0 * height / width
     return CropRegion((1.0 - wide) / 2.0, (1.0 - high) / 2.0, wide, high)
@@ -173,9 +173,9 @@ def region_of_fov(fov_deg: float, width: int, height: int) -> CropRegion:
 def full_size(path: Path, region: CropRegion, size: tuple[int, int]) -> tuple[int, int]:
     """Return width and height [px], 2:1, of the full sphere at the resolution of a picture of `size`.
 
-    Where the sphere is within 1 % of 2:1, the direction with more pixels a degree is shrunk.
+    If the sphere is 2:1 only within 1 %, the direction with more pixels per degree is shrunk.
 
-    Raises InputError if the region does not fit the picture, or the full sphere would be too large.
+    Raise InputError if the region does not fit the picture, or the full sphere would be too large.
     """
     width = size[0] / region.width
     height = size[1] / region.height
@@ -189,15 +189,15 @@ def full_size(path: Path, region: CropRegion, size: tuple[int, int]) -> tuple[in
     if region.width * region.height < MIN_REGION:
         percent = 100.0 * region.width * region.height
         raise InputError(f"{found}, {percent:.2g} % of the sphere, wanted at least {100.0 * MIN_REGION:g} %")
-    full_height = int(min(height, width / 2.0) + 1e-6)  # a quotient may be a hair below a whole number
+    full_height = int(min(height, width / 2.0) + 1e-6)  # a quotient may be rounded below a whole number
     return 2 * full_height, full_height
 
 
 def embed_crop(path: Path, rgb: Bytes, is_valid: Mask, region: CropRegion) -> Pixels:
-    """Return the picture at its place in the full sphere, the rest not valid.
+    """Return the full sphere with a picture at its region; all other pixels are not valid.
 
-    Edges are rounded to whole pixels, so the picture moves by half a pixel at most. It may cross the seam.
-    A full sphere is returned itself.
+    The picture's edges are rounded to whole pixels, which moves it by half a pixel at most. It may cross the
+    seam. A picture that is the full sphere is returned as it is.
     """
     height, width = is_valid.shape
     full_width, full_height = full_size(path, region, (width, height))
@@ -206,7 +206,7 @@ def embed_crop(path: Path, rgb: Bytes, is_valid: Mask, region: CropRegion) -> Pi
     right = left + max(round(region.width * full_width), 1)
     bottom = min(top + max(round(region.height * full_height), 1), full_height)
     size = right - left, bottom - top
-    if is_valid.shape != size[::-1]:  # area-averaged; a pixel is valid if all that went into it is
+    if is_valid.shape != size[::-1]:  # area-averaged: a pixel is valid if all pixels in its average are
         mask = cv2.resize(is_valid.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA)
         small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
         rgb = np.asarray(small, dtype=np.uint8)
@@ -222,14 +222,14 @@ def embed_crop(path: Path, rgb: Bytes, is_valid: Mask, region: CropRegion) -> Pi
 
 
 def check_size(label: str, size: tuple[int, int]) -> None:
-    """Refuse the size of a picture that is no full sphere."""
+    """Refuse a size (width, height) that is not 2:1, as a full sphere's is."""
     width, height = size
     if min(size) < 1 or abs(width - 2 * height) > ASPECT_TOLERANCE * 2 * height:
         raise InputError(f"{label}: found {width} x {height}, wanted width = 2 x height (a full sphere)")
 
 
 class Segment(NamedTuple):
-    """One segment of a JPEG: data[begin:end], marker and length included."""
+    """One segment of a JPEG: data[begin:end], including marker and length."""
 
     marker: int
     begin: int
@@ -239,7 +239,7 @@ class Segment(NamedTuple):
 def with_pose(path: Path, data: bytes, angles_deg: tuple[float, float, float]) -> bytes:
     """Return the JPEG `data` with heading, pitch and roll in its XMP packet; other segments keep their bytes.
 
-    Fields of the pose that were there are replaced. Without a packet one is put behind JFIF's and EXIF's.
+    Fields of an old pose are replaced. If there is no packet, one is put after the segments of JFIF and EXIF.
     """
     segments = list(jpeg_segments(data)) if data.startswith(JPEG_MAGIC) else []
     if not segments or segments[-1].marker != SCAN:
@@ -248,14 +248,14 @@ def with_pose(path: Path, data: bytes, angles_deg: tuple[float, float, float]) -
         size = image.size
     bodies = [data[begin + 4 : end] if marker == APP1 else b"" for marker, begin, end in segments]
     packets = [i for i, body in enumerate(bodies) if body.startswith(XMP_MARK)]
-    edits = []  # begin, end, what comes there
+    edits = []  # begin, end, and the bytes that replace data[begin:end]
     for i in packets:
         packet = without_pose(bodies[i][len(XMP_MARK) :])
         if i == packets[0]:
             packet = _with_fields(path, packet, angles_deg, size)
         edits.append((segments[i].begin, segments[i].end, _segment(path, packet)))
     if not packets:
-        pairs = zip(segments, bodies, strict=True)  # JFIF's and EXIF's segments have to be the first
+        pairs = zip(segments, bodies, strict=True)  # the segments of JFIF and EXIF must be the first
         first = takewhile(lambda pair: pair[0].marker == APP0 or pair[1].startswith(EXIF_MARK), pairs)
         place = max((segment.end for segment, _ in first), default=len(JPEG_MAGIC))
         edits = [(place, place, _segment(path, _with_fields(path, EMPTY_PACKET, angles_deg, size)))]
@@ -271,7 +271,7 @@ def jpeg_segments(data: bytes) -> Iterator[Segment]:
     """Yield the segments of a JPEG up to the header of its first scan; fewer if it is damaged."""
     begin = len(JPEG_MAGIC)
     while found := MARKER.match(data, begin):
-        begin = found.end() - 1  # a marker may be filled up with FF
+        begin = found.end() - 1  # FF bytes may come before a marker
         if begin + 4 > len(data):
             return
         marker, length = struct.unpack_from(">xBH", data, begin)
@@ -292,7 +292,7 @@ def _segment(path: Path, packet: bytes) -> bytes:
 
 
 def without_pose(packet: bytes) -> bytes:
-    """Return the packet without the fields of a pose, as attributes or as elements."""
+    """Return the packet without the fields of a pose, whether these are attributes or elements."""
     for prefix in dict.fromkeys(PREFIX.findall(packet)):
         for name in POSE_NAMES:
             field = re.escape(prefix) + b":" + name.encode()
@@ -304,9 +304,9 @@ def without_pose(packet: bytes) -> bytes:
 def _with_fields(
     path: Path, packet: bytes, angles_deg: tuple[float, float, float], size: tuple[int, int]
 ) -> bytes:
-    """Return the packet with a description more, of the pose and of what a viewer needs and is not there yet.
+    """Return the packet with a description added: the pose, and fields that viewers need, if missing.
 
-    A packet without an end of its RDF is damaged and gives way to a new one.
+    A packet without the end of its RDF is damaged; a new packet replaces it.
     """
     if not END.search(packet):
         packet = EMPTY_PACKET
@@ -319,7 +319,7 @@ def _with_fields(
         fields |= {name: str(value) for name, value in zip(CROP_FIELDS, (0, 0, *size, *size), strict=True)}
     fields |= {n: f"{angle:.{DECIMALS}f}" for n, angle in zip(POSE_NAMES, angles_deg, strict=True)}
     attributes = "".join(f' GPano:{name}="{value}"' for name, value in fields.items()).encode()
-    about = ABOUT.search(packet)  # has to be the same in all descriptions
+    about = ABOUT.search(packet)  # must be the same in all descriptions
     rdf = end[1]
     place = end.start()
     description = b"<%s:Description %s:about=%s" % (rdf, rdf, about.group(1) if about else b'""')

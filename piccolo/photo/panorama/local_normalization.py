@@ -14,16 +14,16 @@ from ...system.kernels.jit import F0, F1, HALF, Scalar, copy_to, inline_kernel, 
 from . import Panorama
 from .texels import TEXEL_CHUNK, Texels, make_chunk, project, sample
 
-CLIP = 2.0  # deviations; what differs more from its surroundings counts no more
-MIN_DEVIATION = 0.03  # of a channel in [0, 1]: flatter surroundings are not amplified further
-ZERO_LEVEL = 127.5  # the level of 0
-LEVELS_PER_UNIT = 127.5 / CLIP
+CLIP = 2.0  # [standard deviations] larger differences from the surroundings count as this
+MIN_DEVIATION = 0.03  # of a channel in [0, 1]: in flatter surroundings contrast is not amplified further
+ZERO_LEVEL = 127.5  # the level of a normalised channel of 0
+LEVELS_PER_UNIT = 127.5 / CLIP  # per standard deviation
 OPPONENT = np.array([[1 / 3, 1 / 3, 1 / 3], [1 / 2, 0, -1 / 2], [-1 / 4, 1 / 2, -1 / 4]], np.float32)
 
 _CLIP = np.float32(CLIP)
 _MIN_VARIANCE = np.float32(MIN_DEVIATION * MIN_DEVIATION)
-STATS_WIDTH = 128  # [px] local means vary over 10 degrees and more
-LEAST_NEIGHBOR_WEIGHT = np.float32(1e-9)  # of neighbours that count, where hardly any does
+STATS_WIDTH = 128  # [px] of the sphere for statistics, enough as these vary over 10 degrees and more
+LEAST_NEIGHBOR_WEIGHT = np.float32(1e-9)  # sum of the weights of valid neighbours, at least
 
 
 @inline_kernel
@@ -40,14 +40,14 @@ def zscore(value: Scalar, mean: Scalar, inverse_std: Scalar) -> Scalar:
 
 @inline_kernel
 def mean_and_inverse_std(total: Scalar, squares: Scalar, per: Scalar) -> tuple[Scalar, Scalar]:
-    """Return mean and 1 / deviation, bounded, from weighted sums, `per` being 1 / the sum of the weights."""
+    """Return mean and 1 / deviation, bounded, from weighted sums; `per` is 1 / sum of the weights."""
     mean = total * per
     return mean, F1 / math.sqrt(max(squares * per - mean * mean, F0) + _MIN_VARIANCE)
 
 
 @lru_cache(maxsize=8)
 def sphere_gaussian(width: int, sigma_deg: float) -> Array:
-    """Compute spectra over azimuth (W / 2 + 1, H, H) of Gaussian weights between rows, times solid angle."""
+    """Return spectra over azimuth (W / 2 + 1, H, H) of Gaussian weights between rows, times solid angles."""
     rays = pixel_rays(width)
     sigma = np.radians(sigma_deg)
     weight = np.empty((width // 2, width // 2, width))
@@ -59,7 +59,7 @@ def sphere_gaussian(width: int, sigma_deg: float) -> Array:
 def blur_sphere(image: Array32, sigma_deg: float) -> Array32:
     """Return the Gaussian weighted sums (H, W, C) over the sphere of an equirectangular image (H, W, C).
 
-    It computes in float64, so that rounding to float32 removes the differences between BLAS libraries.
+    They are computed in float64: rounding to float32 then removes the differences between BLAS libraries.
     """
     spectrum = np.fft.rfft(image.astype(np.float64), axis=1).transpose(1, 0, 2)
     gains = sphere_gaussian(image.shape[1], sigma_deg)
@@ -70,7 +70,7 @@ def blur_sphere(image: Array32, sigma_deg: float) -> Array32:
 
 @kernel
 def block_moments(channels: Array32, weight: Array32, moments: Array32) -> None:
-    """Write (h, w, 7): weighted sums of 1, the channels and their squares over equal blocks of the image."""
+    """Write the weighted sums (h, w, 7) of 1, channels and their squares over equal blocks of the image."""
     step = channels.shape[0] // moments.shape[0]
     for i in range(moments.shape[0]):
         for j in range(moments.shape[1]):
@@ -93,7 +93,7 @@ def block_moments(channels: Array32, weight: Array32, moments: Array32) -> None:
 
 @inline_kernel
 def interpolation_along(num: int, num_wider: int) -> tuple[NDArray[np.uintp], NDArray[np.uintp], Array32]:
-    """Locate a row's `num` pixels between wider ones: left and right neighbours (num,), and fractions."""
+    """Locate `num` pixels of a row between wider ones: left and right neighbour, and fraction (num,)."""
     left = np.empty(num, np.uintp)
     right = np.empty(num, np.uintp)
     fraction = np.empty(num, np.float32)
@@ -109,7 +109,7 @@ def interpolation_along(num: int, num_wider: int) -> tuple[NDArray[np.uintp], ND
 
 @inline_kernel
 def as_texel_channel(value: Scalar, mean: Scalar, gain: Scalar, shift: int) -> np.int32:
-    """Return the bits of a texel that hold a channel's normalised value in levels."""
+    """Return a channel, normalised and in levels, as bits of a texel shifted by `shift`."""
     level = np.int32(zscore(value, mean, gain) * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL + 0.5))
     return np.int32(min(level, np.int32(255)) << np.int32(shift))
 
@@ -120,9 +120,9 @@ def pack_normalized(
 ) -> None:
     """Write padded RGBX texels (H + 2, W + 2): (channel - mean) / deviation in levels, and validity.
 
-    Channels and weights are those of a box of the image; `corner` is its first row and column. Means and
-    1 / standard deviations are interpolated bilinearly in `stats` (h, w, 6). On each side a column of texels
-    is wrapped and a row clamped.
+    Channels and weights are those of a box of the image, whose first row and column are `corner`. Means and
+    1 / standard deviations are interpolated bilinearly in `stats` (h, w, 6). The padding is a column on each
+    side, which wraps, and a row above and below, which repeats.
     """
     top, begin = corner
     height = texels.shape[0] - 2
@@ -147,7 +147,7 @@ def pack_normalized(
             for j in range(num):
                 at = wide[c, left[j]]
                 along[c, j] = at + fraction[j] * (wide[c, right[j]] - at)
-        planes = channels[i].T.copy()  # (3, num): what follows is vectorised then
+        planes = channels[i].T.copy()  # (3, num), so that the loop below is vectorised
         row = texels[top + i + 1, begin + 1 : begin + num + 1]
         for j in range(num):
             texel = as_texel_channel(planes[0, j], along[0, j], along[3, j], 0)
@@ -163,7 +163,7 @@ def pack_normalized(
 
 @kernel
 def finish_statistics(sums: Array32) -> None:
-    """Turn weighted sums (h, w, 7) of 1, channels, squares into means and 1 / deviations (h, w, 1:7)."""
+    """Replace weighted sums (h, w, 7) of 1, channels, squares by means and 1 / deviations in columns 1:7."""
     for i in range(sums.shape[0]):
         for j in range(sums.shape[1]):
             s = sums[i, j]
@@ -180,8 +180,8 @@ def opponent_channels(rgb: Array32) -> Array32:
 def local_statistics(channels: Array32, weight: Array32, width: int, sigma_deg: float) -> Array32:
     """Compute local means and 1 / standard deviations (width / 2, width, 6) of channels (H, W, 3).
 
-    They are taken over a Gaussian on the sphere, weighted by `weight` (H, W) and the solid angle; W is a
-    multiple of `width`.
+    The weights are a Gaussian on the sphere times `weight` (H, W) times the solid angle. W must be a multiple
+    of `width`.
     """
     moments = np.empty((width // 2, width, 7), np.float32)
     block_moments(channels, weight, moments)
@@ -195,28 +195,28 @@ def smooth_statistics(moments: Array32, sigma_deg: float) -> Array32:
     return np.asarray(sums[..., 1:])
 
 
-def normalize_locally(rgb: Array32, counts: Mask, sigma_deg: float) -> Array32:
-    """Return opponent channels (H, W, 3), locally normalised over the pixels that count; elsewhere 0."""
+def normalize_locally(rgb: Array32, is_valid: Mask, sigma_deg: float) -> Array32:
+    """Return opponent channels (H, W, 3), locally normalised over the valid pixels; 0 in others."""
     channels = opponent_channels(rgb)
-    weight = counts.astype(np.float32)
+    weight = is_valid.astype(np.float32)
     statistics = local_statistics(channels, weight, rgb.shape[1], sigma_deg)
     normalized = (channels - statistics[..., :3]) * statistics[..., 3:]
     return np.asarray(np.clip(normalized, -CLIP, CLIP) * weight[..., None])
 
 
 def normalize_panorama(panorama: Panorama, cell_deg: float, sigma_deg: float) -> Texels:
-    """Average opponent channels over `cell_deg`, normalise over `sigma_deg`; STATS_WIDTH divides W.
+    """Return a panorama's opponent channels, averaged over `cell_deg` and normalised over `sigma_deg`.
 
-    What does not count is left 0 outside of a box around what does.
+    W must be a multiple of STATS_WIDTH. Texels outside of a box around the valid pixels are 0.
     """
     height, width = panorama.is_valid.shape
-    is_averaged = cell_deg * width / 360.0 > 1.5  # cells wider than pixels: over the whole sphere
+    is_averaged = cell_deg * width / 360.0 > 1.5  # then the box is the whole sphere
     step = width // STATS_WIDTH
     rows = find_span(np.asarray(panorama.is_valid.any(axis=1) | is_averaged), step)
     columns = find_span(np.asarray(panorama.is_valid.any(axis=0) | is_averaged), step)
     weight = panorama.is_valid[rows, columns].astype(np.float32)
     channels = opponent_channels(panorama.rgb[rows, columns].astype(np.float32) / np.float32(255.0))
-    if is_averaged:  # by a Gaussian with a cell's second moment
+    if is_averaged:  # by a Gaussian with the second moment of a cell
         sums = blur_sphere(np.dstack([channels * weight[..., None], weight]), cell_deg / math.sqrt(12.0))
         channels = np.asarray(sums[..., :3] / np.maximum(sums[..., 3:], LEAST_NEIGHBOR_WEIGHT), np.float32)
     inner = np.empty((len(weight) // step, weight.shape[1] // step, 7), np.float32)
@@ -231,19 +231,22 @@ def normalize_panorama(panorama: Panorama, cell_deg: float, sigma_deg: float) ->
     return Texels(texels.reshape(-1), width)
 
 
-def find_span(counts: Mask, step: int) -> slice:
-    """Return the span of what counts (N,), in whole steps: the first one if nothing does."""
-    found = np.flatnonzero(counts)
-    if len(found) == 0:
+def find_span(is_used: Mask, step: int) -> slice:
+    """Return the span of the True elements (N,), widened to whole steps; the first step if there are none."""
+    used = np.flatnonzero(is_used)
+    if len(used) == 0:
         return slice(0, step)
-    return slice(int(found[0]) // step * step, -(-(int(found[-1]) + 1) // step) * step)
+    return slice(int(used[0]) // step * step, -(-(int(used[-1]) + 1) // step) * step)
 
 
 @kernel
 def sample_channels(
     texels: Int32s, width: int, directions: Array32, rotations: Array32, samples: Array32, validity: Array32
 ) -> None:
-    """Write channels (rotations, 3, cells), minus the zero level, and validity in turned directions."""
+    """Write the channels (rotations, 3, cells), minus the zero level, and their validity (rotations, cells).
+
+    They are sampled in the `directions` (cells, 3), turned by each of the rotations (rotations, 3, 3).
+    """
     p = make_chunk()
     center = np.zeros(3)
     zero = np.float32(ZERO_LEVEL)

@@ -1,8 +1,8 @@
-"""Masks: from a picture file, of the cap around a pole, and of what is recognised in the picture itself.
+"""Masks: from a picture file, of the cap around a pole, and of borders and patches found in the picture.
 
-Black borders and patches over the nadir or zenith are masked, pictures of two fisheyes recognised. Each rule
-is narrow, as wrongly masked pixels are lost. The thresholds were set by hand, apart from both sides:
-tests/test_panorama_masks.py has the rooms that they must not change and the patches that they find.
+Black borders and patches over the nadir or zenith are masked; pictures of two fisheyes are recognised. Each
+rule is narrow, as wrongly masked pixels are lost. The thresholds were set by hand, with a distance to both
+sides: tests/test_panorama_masks.py has rooms in which nothing may be masked, and patches that must be found.
 """
 
 import math
@@ -20,49 +20,50 @@ from ...system.errors import InputError
 from .gpano import ASPECT_TOLERANCE
 from .picture import read_picture
 
-NEAR_BLACK = 8  # levels where a border goes on
-BLACK_LEVEL = 2  # levels that most of it has
-MIN_FULL_EDGE = 0.99  # of a full sphere's edge: its rows at the poles and its seam are black as a whole
-MIN_CROP_EDGE = 1.0 / 64.0  # of a crop's edge, which may be ragged
-MIN_PURE = 0.95  # of a border's pixels that are BLACK_LEVEL
-RIM = 8  # [px] that JPEG smears a border's edge: a block
+NEAR_BLACK = 8  # [levels] of a border's pixels, at most
+BLACK_LEVEL = 2  # [levels] of most of them, at most
+MIN_FULL_EDGE = 0.99  # of a full sphere's edge that is black: a row at a pole is one point, the seam one line
+MIN_CROP_EDGE = 1.0 / 64.0  # of a crop's edge that is black: its borders may be ragged
+MIN_PURE = 0.95  # of a border's pixels that are BLACK_LEVEL or less
+RIM = 8  # [px] by which JPEG blurs a border's edge: a block
 ROWS_AT_ONCE = 64
 
-DISC_WIDTH = 720  # [px] discs are looked for at this size, rows of half a degree; not in smaller pictures
+DISC_WIDTH = 720  # [px] at which discs are searched: rows of half a degree; not in smaller pictures
 ROWS_PER_DEG = DISC_WIDTH / 360.0
-NUM_ROWS = round(45.0 * ROWS_PER_DEG)  # around a pole
+NUM_ROWS = round(45.0 * ROWS_PER_DEG)  # around a pole, in which discs are searched
 # numbers of rows inside a disc, largest first: half angles of 40 to 3 deg
 CANDIDATES = range(round(40.0 * ROWS_PER_DEG), round(3.0 * ROWS_PER_DEG) - 1, -1)
-MIN_STEP = 12.0  # levels between inside and outside of a disc's edge
-MIN_EDGE_FRACTION = 0.9  # of columns with a step at the edge
-MAX_CALM_FRACTION = 0.5  # in the rows near it
+MIN_STEP = 12.0  # [levels] between inside and outside of a disc's edge
+MIN_EDGE_FRACTION = 0.9  # of the columns that have such a step at the edge
+MAX_CALM_FRACTION = 0.5  # of the columns that have one in the rows near the edge, at most
 NUM_SECTORS = 16
 DETAIL_DEG = 0.5  # over which detail is measured
-MIN_DETAIL = 4.0  # levels, around a disc without detail
-MIN_DETAIL_RATIO = 5.0  # of detail outside by detail inside
-NEAR_ROWS = round(2.0 * ROWS_PER_DEG)  # on each side, in which it is
+MIN_DETAIL = 4.0  # [levels] of detail around a disc that has none
+MIN_DETAIL_RATIO = 5.0  # of detail outside to detail inside
+NEAR_ROWS = round(2.0 * ROWS_PER_DEG)  # on each side of a disc's edge, in which detail is compared
 # Set by hand, between the circles and the panoramas of tests/test_panorama_masks.py.
 FISHEYE_SIZE = 128  # [px] of each half, for the test
-FISHEYE_BLACK = 24  # levels: the dark around the circles carries some noise
-MIN_BLACK_OUTSIDE = 0.98
-MIN_BRIGHT_INSIDE = 0.7  # of each sector of a ring within the circle
+FISHEYE_BLACK = 24  # [levels] of the pixels around the circles, at most: they have some noise
+MIN_BLACK_OUTSIDE = 0.98  # of the pixels around the circles
+MIN_BRIGHT_INSIDE = 0.7  # of the pixels in each sector of a ring within the circle
 FISHEYE_SECTORS = 8
 MIN_ALIKE = 0.9  # correlation of the pictures of two eyes, without the mean of each row
-MIN_MASK = (16, 8)  # [px]
-WHITE_LEVEL = 128  # and above is to be ignored
+MIN_MASK = (16, 8)  # [px] width and height of a mask's picture
+WHITE_LEVEL = 128  # [levels] a mask's pixel is white from here on
 
 
 def black_borders(rgb: Bytes, is_valid: Mask, is_full: bool) -> Mask | None:
-    """Return a mask (H, W) of unfilled pixels that are valid so far; None if there are none.
+    """Return the mask (H, W) of the black borders of a picture; None if there are none.
 
-    From each edge that is near black it takes the pixels inwards up to the first that is not near black. In a
-    full sphere the edge must be black as a whole (a pole is one point, the seam one line), in a crop in part.
-    95 % of the pixels, except a rim of 8 pixels, must be black to two levels; shadows carry noise.
+    A border begins at an edge of the picture that is near black and valid, and goes inwards up to the first
+    pixel that is not near black. In a full sphere the whole edge must be black (a pole is one point, the seam
+    one line), in a crop a part of it. 95 % of a border's pixels, except for a rim of 8 pixels, must be black
+    within two levels: shadows have more noise.
     """
     if rgb[0].max() <= BLACK_LEVEL and rgb.max() <= BLACK_LEVEL:
         return np.ones(is_valid.shape, dtype=np.bool_)
     min_fraction = MIN_FULL_EDGE if is_full else MIN_CROP_EDGE
-    found = np.zeros(is_valid.shape, dtype=np.bool_)
+    is_border = np.zeros(is_valid.shape, dtype=np.bool_)
     for axis in (0, 1):
         for step in (1, -1):
             inwards = rgb.swapaxes(0, axis)[::step]
@@ -73,19 +74,19 @@ def black_borders(rgb: Bytes, is_valid: Mask, is_full: bool) -> Mask | None:
             core = np.maximum(_filter_depths(cv2.erode, depth) - RIM, 0)
             if _black_fraction(inwards, core if core.any() else depth) >= MIN_PURE:
                 depth = np.where(depth > 0, depth + RIM, 0)
-                border = found.swapaxes(0, axis)[::step][: depth.max()]
+                border = is_border.swapaxes(0, axis)[::step][: depth.max()]
                 border |= np.arange(len(border))[:, None] < _filter_depths(cv2.dilate, depth)
-    return found if found.any() else None
+    return is_border if is_border.any() else None
 
 
 def _filter_depths(which: Callable[..., Any], depth: Int64s) -> Int64s:
     """Return the least (cv2.erode) or largest (cv2.dilate) of the depths (columns,) within RIM of each."""
-    column = depth[:, None].astype(np.float32)  # whole numbers that small are exact
+    column = depth[:, None].astype(np.float32)  # exact, as the whole numbers are small
     return np.asarray(which(column, np.ones((2 * RIM + 1, 1), np.uint8))[:, 0], np.int64)
 
 
 def _depth_of_black(inwards: Bytes, is_black: Mask) -> Int64s:
-    """Return the number of near black pixels from the edge (row 0) inwards, in columns black there."""
+    """Return the number (columns,) of near black pixels inwards from the edge (row 0), where it is black."""
     depth = np.zeros(len(is_black), dtype=np.int64)
     for begin in range(0, len(inwards), ROWS_AT_ONCE):
         band = np.ascontiguousarray(inwards[begin : begin + ROWS_AT_ONCE])
@@ -111,10 +112,10 @@ def _black_fraction(inwards: Bytes, depth: Int64s) -> float:
 def polar_disc(rgb: Bytes, is_valid: Mask, pole: str) -> float:
     """Return the half angle [deg] of a disc over the `pole` of a full sphere; 0 if there is none.
 
-    The pole is zenith or nadir. The border is a circle of latitude that is an edge in 90 % of all directions
-    while the rows near it are not (a logo, a plain colour), or at which all detail ends in every direction (a
-    blur). Scenes have no such circles, except for round things directly over or under the camera, such as its
-    own stand.
+    The pole is zenith or nadir. The disc's border is a circle of latitude that is an edge in 90 % of all
+    directions while the rows near it are not (a logo, a plain colour), or at which all detail ends in every
+    direction (a blur). Scenes have no such circles, except by round things directly over or under the camera,
+    such as its own stand.
     """
     num_rows = round(NUM_ROWS / DISC_WIDTH * rgb.shape[1])
     rows = slice(num_rows) if pole == "zenith" else slice(-num_rows, None)
@@ -156,9 +157,9 @@ def _detail_circle(cap: Array32) -> int:
     second = grey.ravel()[east] + grey.ravel()[west] - 2.0 * grey
     detail = np.abs(second).reshape(NUM_ROWS, NUM_SECTORS, -1).mean(axis=2)
     ends = np.cumsum(np.concatenate([np.zeros((1, NUM_SECTORS)), detail]), axis=0)
-    within = (ends[NEAR_ROWS:] - ends[:-NEAR_ROWS]) / NEAR_ROWS  # mean of the NEAR_ROWS from each row on
+    within = (ends[NEAR_ROWS:] - ends[:-NEAR_ROWS]) / NEAR_ROWS  # mean of the NEAR_ROWS rows from each row on
     for k in CANDIDATES:
-        inside = within[k - 1 - NEAR_ROWS]  # row k - 1 is half a step: left out
+        inside = within[k - 1 - NEAR_ROWS]  # without row k - 1, in which the step may be
         outside = within[k + 1]
         if (outside < np.maximum(MIN_DETAIL_RATIO * inside, MIN_DETAIL)).any():
             continue
@@ -168,12 +169,12 @@ def _detail_circle(cap: Array32) -> int:
 
 
 def is_dual_fisheye(rgb: Bytes) -> bool:
-    """Return True if a picture is black outside the two circles inscribed in its halves, but not in them.
+    """Return True if a picture is black around the two circles inscribed in its halves, but not in them.
 
-    A panorama with black poles is black within the circles' upper and lower parts too; a dark one is dark all
-    around. Circles down to 0.9 of the halves' height are found.
+    A panorama with black poles is also black in the upper and lower parts of the circles, and a dark one is
+    dark everywhere. Circles down to 0.9 of the halves' height are found.
     """
-    upper = rgb[: max(len(rgb) // FISHEYE_SIZE, 1)]  # of which three quarters are outside
+    upper = rgb[: max(len(rgb) // FISHEYE_SIZE, 1)]  # three quarters of this are outside of circles
     if np.median(upper) >= 2 * FISHEYE_BLACK:
         return False
     small = cv2.resize(rgb, (2 * FISHEYE_SIZE, FISHEYE_SIZE), interpolation=cv2.INTER_AREA).max(axis=2)
@@ -191,9 +192,9 @@ def is_dual_fisheye(rgb: Bytes) -> bool:
 
 
 def shows_twice(rgb: Bytes, axis: int) -> bool:
-    """Return True if two halves along an axis show the same, as the pictures of two eyes do.
+    """Return True if the two halves of a picture along an axis show the same, as pictures for two eyes do.
 
-    Beside each other, they have an edge between them; a sphere has none, also of a room that repeats.
+    Halves beside each other must also have an edge between them: spheres have none, even in repeating rooms.
     """
     small = cv2.resize(rgb, (2 * FISHEYE_SIZE, 2 * FISHEYE_SIZE), interpolation=cv2.INTER_AREA).astype(float)
     steps = np.abs(np.diff(small, axis=1)).mean(axis=(0, 2))
@@ -205,9 +206,9 @@ def shows_twice(rgb: Bytes, axis: int) -> bool:
 
 
 def find_mask(mask: Path, pano: Path) -> Path | None:
-    """Return the file of a mask: `mask`, or in that folder the file named as the panorama, or None.
+    """Return the file of a panorama's mask: `mask`, or if that is a folder, the file in it with its name.
 
-    COLMAP appends `.png` to the panorama's name, Metashape `_mask` to that without suffix.
+    Return None if there is none. COLMAP appends `.png` to the panorama's name, Metashape `_mask` to its stem.
     """
     if not mask.is_dir():
         return mask
@@ -216,11 +217,12 @@ def find_mask(mask: Path, pano: Path) -> Path | None:
 
 
 def read_mask(path: Path, sizes: list[tuple[int, int]], is_black_ignored: bool = False) -> tuple[int, Mask]:
-    """Return the index of the size (width, height) whose shape a mask has, and its pixels that count (H, W).
+    """Read a mask for a picture with one of some sizes (width, height), which its shape tells.
 
-    A larger mask masks a pixel if any of its own pixels there is ignored, a smaller one is enlarged.
+    Return the index of the size, and the mask (H, W) at that size, True for valid pixels. A larger mask
+    ignores a pixel if any of its own pixels there is ignored; a smaller one is enlarged.
 
-    Raises InputError if the mask can't be read, or has the shape of none of the sizes, within 1 %.
+    Raise InputError if the mask can't be read, or has the shape of none of the sizes, within 1 %.
     """
     rgb = read_picture(path, MIN_MASK).rgb
     height, width = rgb.shape[:2]
@@ -228,7 +230,7 @@ def read_mask(path: Path, sizes: list[tuple[int, int]], is_black_ignored: bool =
         if abs(width * size[1] - height * size[0]) <= ASPECT_TOLERANCE * height * size[0]:
             white = WHITE_LEVEL if rgb.max() > 1 else 1  # scripts write True as 1
             is_white = ((rgb.max(axis=2) >= white) != is_black_ignored).astype(np.float32)
-            # averages of a larger mask are above 0 where any pixel is white
+            # the average of a larger mask is above 0 where any of its pixels is white
             method = cv2.INTER_AREA if width > size[0] else cv2.INTER_NEAREST
             return k, np.asarray(cv2.resize(is_white, size, interpolation=method) == 0)
     wanted = " or ".join(f"{size[0]} x {size[1]}" for size in sizes)
@@ -236,7 +238,7 @@ def read_mask(path: Path, sizes: list[tuple[int, int]], is_black_ignored: bool =
 
 
 def mask_pole(is_valid: Mask, pole: str, half_angle_deg: float) -> Mask:
-    """Return validity (H, W) without the rows whose centre is within `half_angle_deg` of the `pole`."""
+    """Return a mask (H, W) without the rows whose centre is within `half_angle_deg` of the `pole`."""
     if half_angle_deg <= 0.0:
         return is_valid
     height = len(is_valid)

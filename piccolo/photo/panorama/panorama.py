@@ -1,4 +1,4 @@
-"""A panorama at any size, with its metadata."""
+"""Panoramas, pictures of a full sphere at any size, with their metadata."""
 
 import math
 from dataclasses import dataclass, replace
@@ -13,22 +13,22 @@ from ..camera.resampling import CameraView, make_sphere, shrunk, sphere_width
 
 @dataclass(frozen=True)
 class GPano:
-    """Attitude of the camera by the file's Photo Sphere XMP; None for a missing field."""
+    """Attitude of the camera by the file's Photo Sphere XMP; a missing field is None."""
 
-    pitch_deg: float | None = None  # of the image centre above the horizon, [-90, 90]
-    roll_deg: float | None = None  # about the view axis, the camera's right side down, [-180, 180]
+    pitch_deg: float | None = None  # elevation of the image centre, [-90, 90]
+    roll_deg: float | None = None  # about the view axis, its right side down, [-180, 180]
 
 
 @dataclass(frozen=True)
 class FocalPrior:
-    """A focal length with its deviation, known before a photo is localized, and the photo itself."""
+    """The focal length of a photo as it is known before the photo is localized, and the photo's picture."""
 
-    focal: float  # [px] across
+    focal: float  # [px] along the width
     deviation: float  # standard deviation of its logarithm
-    source: str  # the option that gives it, or EXIF
-    view: CameraView  # the photo, what is masked in it left out
-    is_hidden: Mask  # (H, W) of the sphere, masked beside
-    is_measured: bool = False  # by other photos of the camera
+    source: str  # an option, or EXIF
+    view: CameraView  # the photo's picture, with its masks
+    is_hidden: Mask  # (H, W) pixels of the sphere that are masked besides
+    is_measured: bool = False  # it is by other photos of the camera
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,13 @@ class Panorama:
 
     rgb: Bytes  # (H, W, 3)
     is_valid: Mask  # (H, W), False where the picture shows nothing
-    gpano: GPano | None = None  # None for a file without such metadata
-    warnings: tuple[str, ...] = ()  # what the user should know of the reading
-    cameras: tuple[Mount, ...] = ()  # that took it; none if it came as a sphere or a part of one
-    focal_prior: FocalPrior | None = None  # of the photo of one camera
+    gpano: GPano | None = None  # None without such metadata
+    warnings: tuple[str, ...] = ()  # about the reading, for the user, one line each
+    cameras: tuple[Mount, ...] = ()  # that took it; empty if the file is a sphere or a part of one
+    focal_prior: FocalPrior | None = None  # only for a photo of one camera
 
     def resample(self, camera: Camera, width: int) -> "Panorama":
-        """Return the panorama at a width by another calibration of its camera, which has a focal_prior."""
+        """Return the panorama resampled by another calibration of its camera; it must have a focal_prior."""
         assert self.focal_prior is not None
         mount = self.cameras[0].with_camera(camera)
         rgb, is_valid = make_sphere([self.focal_prior.view._replace(mount=mount)], width)
@@ -54,22 +54,22 @@ class Panorama:
         return replace(self, rgb=rgb, is_valid=is_valid, cameras=(mount,))
 
     def retake(self, camera: Camera) -> "Panorama":
-        """Return the sphere of a picture that came as one, by the camera that shows what it shows of it."""
+        """Return a panorama that came as a sphere, resampled as the picture of a camera."""
         mount = Mount(camera)
         pixels = np.dstack([self.rgb, self.is_valid.view(np.uint8) * np.uint8(255)])
         rgb, is_valid = make_sphere([CameraView(mount, pixels)], sphere_width([mount]))
         return replace(self, rgb=rgb, is_valid=is_valid, cameras=(mount,))
 
     def shrink_picture(self, width: int) -> "Panorama":
-        """Return the panorama, which has a focal_prior, with its picture no finer than a sphere of a width.
+        """Return the panorama with the picture in its focal_prior no finer than a sphere of a width.
 
-        By several calibrations it is then resampled from the same pixels.
+        Whatever the calibration, it is then resampled from the same pixels.
         """
         assert self.focal_prior is not None
         return replace(self, focal_prior=replace(self.focal_prior, view=shrunk(self.focal_prior.view, width)))
 
     def expect_focal(self, focal_px: float, deviation: float) -> "Panorama":
-        """Return the panorama, which has a focal_prior, by the focal length of other photos."""
+        """Return the panorama with the focal length by other photos; it must have a focal_prior."""
         assert self.focal_prior is not None
         camera = self.cameras[0].camera
         taken = self.resample(camera.change(math.log(focal_px / camera.focal[0])), self.rgb.shape[1])
@@ -78,14 +78,15 @@ class Panorama:
 
 
 def shrink(panorama: Panorama, width: int) -> Panorama:
-    """Return the panorama area-averaged to `width` x width / 2, or itself if it is no larger."""
+    """Return the panorama shrunk to `width` x width / 2 by area averages, or itself if it is not larger."""
     return panorama if panorama.rgb.shape[1] <= width else resize(panorama, width)
 
 
 def resize(panorama: Panorama, width: int) -> Panorama:
-    """Return the panorama at `width` x width / 2: area-averaged if that is smaller, else interpolated.
+    """Return the panorama at `width` x width / 2: by area averages if that is smaller, else interpolated.
 
-    Pixels that do not count stay out of the averages; a pixel counts if half of its area does.
+    Pixels that are not valid are left out of the averages; a pixel is valid if half of its area is. Metadata
+    are not kept, unless the panorama has this width already.
     """
     if panorama.rgb.shape[1] == width:
         return panorama
@@ -101,14 +102,14 @@ def resize(panorama: Panorama, width: int) -> Panorama:
     rows = _extent(np.asarray(panorama.is_valid.any(axis=1)), step)
     columns = _extent(np.asarray(panorama.is_valid.any(axis=0)), step)
     box = rows, columns
-    shown = slice(rows.start * step, rows.stop * step), slice(columns.start * step, columns.stop * step)
+    source = slice(rows.start * step, rows.stop * step), slice(columns.start * step, columns.stop * step)
     size = columns.stop - columns.start, rows.stop - rows.start
-    rgb[box], is_valid[box] = _resize_masked(panorama.rgb[shown], panorama.is_valid[shown], size)
+    rgb[box], is_valid[box] = _resize_masked(panorama.rgb[source], panorama.is_valid[source], size)
     return Panorama(rgb, is_valid)
 
 
 def _extent(is_met: Mask, step: int) -> slice:
-    """Return the range of the larger pixels, of `step` pixels (N,) each, from the first met to the last."""
+    """Return the range of larger pixels, `step` pixels (N,) wide, from the first to the last that is True."""
     met = np.flatnonzero(is_met) // step
     return slice(int(met[0]), int(met[-1]) + 1) if len(met) else slice(0, 1)
 

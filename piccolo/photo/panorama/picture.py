@@ -1,7 +1,7 @@
 """The pixels in a JPEG, PNG, TIFF, WebP, HEIC, AVIF or HDR file, 8 bits a channel, turned as EXIF says.
 
-Sizes are checked before anything is decoded. Each format's class is called directly, as Image.open has a
-limit that large panoramas exceed and that can be lifted for the whole process only.
+Sizes are checked before anything is decoded. Each format's class is called directly: Image.open has a limit
+that large panoramas exceed, and it can be lifted only for the whole process.
 """
 
 import subprocess
@@ -37,11 +37,10 @@ MIN_PICTURE_WIDTH = 128
 MIN_PICTURE_HEIGHT = 64
 MAX_PICTURE_WIDTH = 32768
 MAX_PICTURE_HEIGHT = 16384
-PICTURE_BYTES_PER_PIXEL = (
-    12  # while a picture is decoded, turned and masked; 10 were measured, more with alpha
-)
+# of memory while a picture is decoded, turned and masked; 10 were measured, more with alpha
+PICTURE_BYTES_PER_PIXEL = 12
 SPHERE_NAMESPACE = b"http://ns.google.com/photos/1.0/panorama/"
-MAX_XMP_SIZE = 1 << 20  # [byte] what is longer is left aside
+MAX_XMP_SIZE = 1 << 20  # [byte] longer packets are ignored
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 FORMATS: dict[bytes, type[ImageFile]] = {
     PNG_MAGIC: PngImageFile,
@@ -50,13 +49,13 @@ FORMATS: dict[bytes, type[ImageFile]] = {
     b"RIFF": WebPImageFile,
     radiance.MAGIC: RadianceFile,
 }
-# of still pictures, behind a box's size and "ftyp"
+# of still pictures, after the size of a box and "ftyp"
 HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1")
-# at best: a bit a block of 8 x 8; 1040 bytes of 8 pixels by zlib; 3840 by LZW; a plain WebP packs to nothing;
-# 127 pixels in four runs
+# the best compression: a bit for a block of 8 x 8; by zlib 1040 bytes of 8 pixels; by LZW 3840; a plain image
+# packs to nothing in WebP; 127 pixels in four runs
 MAX_PIXELS_PER_BYTE = {"JPEG": 512, "PNG": 8 * 1040, "TIFF": 8 * 3840}
 MAX_PIXELS_PER_BYTE |= dict.fromkeys(("WEBP", "HEIF", "AVIF"), 1 << 30) | {"HDR": 16}
-# what a viewer does to the stored picture, by EXIF's number
+# how a viewer turns the stored picture, by EXIF's orientation
 TURNS: dict[object, Transpose] = {
     2: Transpose.FLIP_LEFT_RIGHT,
     3: Transpose.ROTATE_180,
@@ -74,7 +73,7 @@ REDUCED = 1
 WHITE_IS_ZERO = 0
 UNSIGNED = 1
 END_MARK = b"\xff\xd9"  # of a JPEG
-# libtiff writes what it finds damaged to stderr, which belongs to the whole process
+# run in a process of its own: libtiff reports damage on stderr, which belongs to the whole process
 DECODE_TIFF = """\
 import io, sys
 from PIL import Image, TiffImagePlugin
@@ -84,7 +83,7 @@ image.load()
 sys.stdout.buffer.write(image.convert(sys.argv[1]).tobytes())
 """
 
-# Pillow warns of what it makes do with. Once, here: the filters are the process's, no thread may change them.
+# Pillow's warnings on odd files. Filters are the process's, so they are set once, here, and not by threads.
 warnings.filterwarnings("ignore", module=r"PIL\.")
 
 
@@ -94,10 +93,10 @@ class Picture:
 
     rgb: Bytes  # (H, W, 3)
     is_valid: Mask  # (H, W), False where alpha is 0
-    xmp: bytes = b""
+    xmp: bytes = b""  # packet, or empty
     warnings: tuple[str, ...] = ()
-    exif: Mapping[int, object] = field(default_factory=dict)  # of the camera, by tag; empty if damaged
-    orientation: object = None  # EXIF's number of how the stored picture was turned to become this one
+    exif: Mapping[int, object] = field(default_factory=dict)  # camera and exposure, by tag; empty if damaged
+    orientation: object = None  # EXIF's number, by which the stored picture was turned to become this one
 
     @property
     def size(self) -> tuple[int, int]:
@@ -106,9 +105,9 @@ class Picture:
 
 
 def read_picture(path: Path, min_size: tuple[int, int] = (MIN_PICTURE_WIDTH, MIN_PICTURE_HEIGHT)) -> Picture:
-    """Return the picture in a file; grey becomes RGB, of 16 bits the upper 8 are kept (v >> 8).
+    """Return the picture in a file. Grey becomes RGB; of 16 bits the upper 8 are kept (v >> 8).
 
-    Raises InputError if the file is missing or damaged, of no format read here, or its size is out of range.
+    Raise InputError if the file is missing or damaged, has an unknown format, or its size is out of range.
     """
     data = read_bytes(path, WANTED)
     with open_picture(path, data) as image:
@@ -135,20 +134,20 @@ def read_picture(path: Path, min_size: tuple[int, int] = (MIN_PICTURE_WIDTH, MIN
 
 
 def picture_shape(path: Path) -> tuple[tuple[int, int], object]:
-    """Return width and height [px], and EXIF's orientation or None, of the picture in a file, not decoded."""
+    """Return (width, height) [px] and EXIF's orientation, or None, of the picture in a file, not decoded."""
     with open_picture(path, read_bytes(path, WANTED)) as image:
         return image.size, _orientation(image)
 
 
 @contextmanager
 def open_picture(path: Path, data: bytes) -> Iterator[ImageFile]:
-    """Yield the picture in `data`, opened but not decoded; what Pillow raises becomes an InputError."""
+    """Yield the picture in `data`, opened but not decoded; errors of Pillow become an InputError."""
     if not data:
         raise InputError(f"{path}: the file is empty, {WANTED}")
     kind = next((kind for magic, kind in FORMATS.items() if data.startswith(magic)), None)
     if data[4:8] == b"ftyp" and data[8:12] in HEIF_BRANDS:
         kind = import_optional(path, "pillow_heif").HeifImageFile
-    if data[4:12] == b"ftypavif" and features.check("avif"):  # of Pillow 11.3 and newer
+    if data[4:12] == b"ftypavif" and features.check("avif"):  # Pillow 11.3 and newer
         kind = import_optional(path, "PIL.AvifImagePlugin").AvifImageFile
     if kind is None:
         raise InputError(f"{path}: begins with {data[:8]!r}, {WANTED}")
@@ -156,7 +155,7 @@ def open_picture(path: Path, data: bytes) -> Iterator[ImageFile]:
         yield kind(BytesIO(data))
     except (InputError, MemoryError):
         raise
-    except Exception as error:  # Pillow's readers raise whatever their formats bring
+    except Exception as error:  # Pillow's readers raise errors of many kinds
         words = " ".join(str(error).split())
         why = f"the {kind.format} is cut off, damaged or of an unsupported kind ({words})"
         raise InputError(f"{path}: {why}, {WANTED}") from error
@@ -187,36 +186,36 @@ def _check(path: Path, image: ImageFile, num_bytes: int, min_size: tuple[int, in
 
 def _decode(path: Path, data: bytes, image: ImageFile, mode: str) -> Image.Image:
     """Return the picture decoded, turned as EXIF says, and converted to Pillow's `mode`."""
-    if isinstance(image, TiffImageFile):  # which Pillow turns while it decodes
+    if isinstance(image, TiffImageFile):  # Pillow turns a TIFF while it decodes it
         if image.use_load_libtiff:
             return _decode_apart(path, data, mode, image.size)
-        image.im = Image.new(image.mode, image._tile_size).im  # else Pillow does, with a limit of its own
+        image.im = Image.new(image.mode, image._tile_size).im  # else Pillow makes it, with a limit of its own
     if isinstance(image, PngImageFile):
-        PngImageFile(BytesIO(data)).verify()  # of checksums, which decoding leaves aside
+        PngImageFile(BytesIO(data)).verify()  # the checksums, which decoding ignores
     if isinstance(image, JpegImageFile) and _is_cut(data, image):
         raise InputError(f"{path}: the JPEG ends before its picture does (cut off?), {WANTED}")
-    image.load()  # here, as NumPy would pass over what it raises
+    image.load()  # here, as NumPy would ignore its errors
     converted = image if image.mode == mode else image.convert(mode)
     turn = TURNS.get(_orientation(image))
     return converted if turn is None else converted.transpose(turn)
 
 
 def _orientation(image: ImageFile) -> object:
-    """Return EXIF's orientation number; None where EXIF has none or is damaged.
+    """Return EXIF's orientation number; None if EXIF has none or is damaged.
 
     ImageOps.exif_transpose is not used: it also rewrites EXIF, and raises where EXIF is odd.
     """
     try:
         return image.getexif().get(Base.Orientation)
-    except Exception:  # as above
+    except Exception:  # Pillow raises errors of many kinds for damaged metadata
         return None
 
 
 def read_exif(image: ImageFile) -> dict[int, object]:
-    """Return EXIF's fields of camera and exposure, by tag; empty where EXIF is missing or damaged."""
+    """Return EXIF's fields of camera and exposure, by tag; empty if EXIF is missing or damaged."""
     try:
         return dict(image.getexif().get_ifd(IFD.Exif))
-    except Exception:  # Pillow raises whatever damaged metadata bring
+    except Exception:  # Pillow raises errors of many kinds for damaged metadata
         return {}
 
 
@@ -235,9 +234,9 @@ def _decode_apart(path: Path, data: bytes, mode: str, size: tuple[int, int]) -> 
 
 
 def _is_cut(data: bytes, image: JpegImageFile) -> bool:
-    """Return True for a JPEG just opened that has no end mark, or has it before the picture ends.
+    """Return True if a JPEG that was just opened has no end mark, or has it before the picture ends.
 
-    libjpeg fills missing parts with grey, but with something else if more bytes come before the mark.
+    libjpeg fills missing parts with grey. If bytes are added before the mark, these parts change.
     """
     end = data.find(END_MARK, image.fp.tell() if image.fp else 0)
     width, height = image.size
@@ -249,12 +248,12 @@ def _is_cut(data: bytes, image: JpegImageFile) -> bool:
 
 
 def _xmp(image: ImageFile) -> bytes:
-    """Return the picture's XMP packet; empty if it has none, or one that is damaged or long.
+    """Return the picture's XMP packet; empty if it has none, or one that is damaged or too long.
 
-    Of several in a JPEG it is the one with fields of a Photo Sphere.
+    If a JPEG has several, it is the one with fields of a Photo Sphere.
     """
     packets = [content for name, content in getattr(image, "applist", []) if name == "APP1"]
-    xmp = next((some for some in packets if SPHERE_NAMESPACE in some), image.info.get("xmp", b""))
+    xmp = next((packet for packet in packets if SPHERE_NAMESPACE in packet), image.info.get("xmp", b""))
     return xmp if isinstance(xmp, bytes) and len(xmp) <= MAX_XMP_SIZE else b""
 
 
@@ -266,10 +265,10 @@ def _warnings(image: ImageFile) -> tuple[str, ...]:
 
 
 def encode_image(image: Bytes | NDArray[np.uint16], suffix: str, quality: int = 95) -> bytes:
-    """Return the file, as bytes, of an image (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) gray.
+    """Return the content of an image file, for an image (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) grey.
 
-    The suffix, such as ".png", gives the format; `quality`, up to 100, is that of a JPEG. Raises OSError if
-    the image can't be encoded.
+    The suffix, such as ".png", names the format; `quality`, up to 100, is for JPEG. Raise OSError if the
+    image can't be encoded.
     """
     order = cv2.COLOR_RGBA2BGRA if image.ndim == 3 and image.shape[2] == 4 else cv2.COLOR_RGB2BGR
     bgr = cv2.cvtColor(image, order) if image.ndim == 3 else image

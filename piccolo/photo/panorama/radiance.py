@@ -1,4 +1,4 @@
-"""Pictures of linear light, Radiance HDR (RGBE), as Pillow would open them, in 8 bits."""
+"""Radiance HDR pictures (RGBE), whose pixels are linear light, opened as Pillow's formats are, in 8 bits."""
 
 import re
 from typing import Any
@@ -10,15 +10,15 @@ from PIL.ImageFile import ImageFile
 
 from ...geometry.colors import to_bytes
 
-MAGIC = b"#?R"  # of RADIANCE and RGBE
-RADIANCE_HEAD_SIZE = 1 << 12  # [byte]
+MAGIC = b"#?R"  # of files that begin with #?RADIANCE or #?RGBE
+RADIANCE_HEAD_SIZE = 1 << 12  # [byte] in which the size is searched
 SIZE_LINE = re.compile(rb"\n-Y (\d{1,6}) \+X (\d{1,6})\n")  # upright, as all programs write it
-MIDDLE_GREY = 0.18  # of the light that becomes white
+MIDDLE_GREY = 0.18  # the mean light becomes this fraction of white
 EXPOSED = "HDR, exposed so that the geometric mean of its light is a middle grey; more than white is cut"
 
 
 class RadianceFile(ImageFile):
-    """A Radiance picture, decoded by OpenCV and developed: one exposure for all pixels, then sRGB."""
+    """A Radiance picture, decoded by OpenCV and converted: one exposure for all pixels, then sRGB."""
 
     format = "HDR"
 
@@ -30,7 +30,7 @@ class RadianceFile(ImageFile):
         self._size = int(size[2]), int(size[1])
 
     def load(self) -> Any:
-        """Decode the picture, once."""
+        """Decode the picture, unless that was done before."""
         if self._im is None and self.fp:
             self.fp.seek(0)
             data = np.frombuffer(self.fp.read(), np.uint8)

@@ -1,4 +1,4 @@
-"""A picture file or a folder of cube faces, read as a panorama: a full sphere, and the pixels that count."""
+"""Reading of panoramas: picture files, folders of cube faces and arrays become full spheres with masks."""
 
 import math
 from dataclasses import replace
@@ -23,8 +23,8 @@ from .masks import black_borders, find_mask, is_dual_fisheye, mask_pole, polar_d
 from .panorama import FocalPrior, GPano, Panorama
 from .picture import PICTURE_BYTES_PER_PIXEL, Picture, picture_shape, read_picture
 
-Shot = tuple[Path, Picture, tuple[Mount, ...]]  # a file with the cameras that took it
-PHOTO_FOV_DEG = 65, 50  # of a phone's main camera, 24 to 28 mm on film: 63 to 72 wide, upright 50 to 57
+Shot = tuple[Path, Picture, tuple[Mount, ...]]  # a file, its picture, and the cameras that took it
+PHOTO_FOV_DEG = 65, 50  # width by a phone's main camera (24 to 28 mm): 63 to 72, if held upright 50 to 57
 CHOICES = (
     "If a camera took it, give `focal_px` or `camera`; if its focal length is unknown, `projection` pinhole "
     "`fov_deg` {} `refine_focal`. If it is a part of a panorama, give `fov_deg`. If it is a cube, give "
@@ -36,18 +36,18 @@ LIKE_A_PHOTO = (
     "pinhole, for a part of a panorama `projection` equirectangular"
 )
 NO_HORIZON = "the metadata call the crop's height the sphere's: its horizon is assumed to be in the middle"
-MIN_REPORTED_SHARE = 0.001  # of the sphere: borders below this are masked without a warning
+MIN_REPORTED_SHARE = 0.001  # of the sphere: smaller borders are masked without a warning
 
 
 def read_panorama(photo: File | Bytes | Photo) -> Panorama:
     """Return the full sphere of a picture file, a folder of six cube faces or an array.
 
-    Colours have 8 bits (of 16 the upper 8, v >> 8), grey becomes RGB, EXIF's orientation is applied. Not
-    valid are pixels of alpha 0, outside a crop, masked, in black borders and in discs over a pole. Of
-    an array only masked pixels are not.
+    Colours have 8 bits (of 16 the upper 8, v >> 8), grey becomes RGB, EXIF's orientation is applied. Pixels
+    are not valid if they have alpha 0, are outside of a crop, are masked, or lie in a black border or a disc
+    over a pole. In an array only masked pixels are not valid.
 
-    InputError if the file is missing or damaged, of another format or projection, its size is out of range,
-    or the part of the sphere that it shows is unknown.
+    Raise InputError if the file is missing or damaged, has another format or projection, if its size is out
+    of range, or if it is unknown what part of the sphere it shows.
     """
     photo = as_photo(photo)
     panorama = _read(photo)
@@ -57,7 +57,7 @@ def read_panorama(photo: File | Bytes | Photo) -> Panorama:
 
 
 def _read(photo: Photo) -> Panorama:
-    """Read a photo; its attitude is that of the file."""
+    """Read a photo with the attitude that its file gives."""
     if isinstance(photo.picture, np.ndarray):
         return _read_array(photo, photo.picture)
     if photo.instant is not None:
@@ -89,7 +89,7 @@ def _read_picture(photo: Photo) -> Panorama:
 
 
 def _read_array(photo: Photo, rgb: Bytes) -> Panorama:
-    """Return the panorama of an image (H, W, 3), of the photo's camera or a full sphere."""
+    """Return the panorama of an array (H, W, 3): a full sphere, or the picture of the photo's camera."""
     rgb = np.ascontiguousarray(rgb)
     is_valid = ~photo.mask if isinstance(photo.mask, np.ndarray) else np.ones(rgb.shape[:2], np.bool_)
     picture = Picture(rgb, is_valid)
@@ -103,7 +103,7 @@ def _read_array(photo: Photo, rgb: Bytes) -> Panorama:
 
 
 def _read_rig(photo: Photo, rig: Calibration) -> Panorama:
-    """Return the panorama of the pictures of one instant."""
+    """Return the panorama of a rig's pictures of one instant."""
     folder = photo.path
     files = rig.images_in(folder)
     pictures = [read_picture(file) for file in files]
@@ -118,9 +118,9 @@ def _read_rig(photo: Photo, rig: Calibration) -> Panorama:
 def _on_sphere(
     photo: Photo, shots: list[Shot], attitude: GPano | None, of_one: Cameras | None = None
 ) -> Panorama:
-    """Project the pictures of one instant, each with its file and cameras, to one sphere, and apply masks.
+    """Resample the pictures of one instant, each with its file and cameras, to one sphere; apply masks.
 
-    `of_one` tells how well the focal length of a picture's one camera is known.
+    `of_one`, for a single picture, has the standard deviation and the source of the focal length.
     """
     cameras = tuple(mount for *_, mounts in shots for mount in mounts)
     width = sphere_width(cameras)
@@ -128,30 +128,30 @@ def _on_sphere(
     check_memory(num_bytes, f"{photo.path}: the sphere of {width} x {width // 2}", "make the picture smaller")
     views: list[CameraView] = []
     notes: list[str] = []
-    counts = None
+    sphere_mask = None
     for file, picture, mounts in shots:
         masks = _user_masks(file, [picture.size, (width, width // 2)], photo, notes)
         if 1 in masks:
-            counts = masks[1] if counts is None else counts & masks[1]
+            sphere_mask = masks[1] if sphere_mask is None else sphere_mask & masks[1]
         is_valid = picture.is_valid & masks[0] if 0 in masks else picture.is_valid
-        found, more = read_views(file, picture, mounts, is_valid)
-        views += found
+        own, more = read_views(file, picture, mounts, is_valid)
+        views += own
         notes += [*picture.warnings, *more]
     rgb, is_valid = make_sphere(views, width)
     panorama = Panorama(rgb, is_valid, attitude, tuple(dict.fromkeys(notes)), cameras)
-    masked = _mask(photo, panorama, counts)
+    masked = _mask(photo, panorama, sphere_mask)
     if of_one is None or len(cameras) > 1:
         return masked
     is_hidden = is_valid & ~masked.is_valid
     if not is_hidden.any():
-        is_hidden = np.zeros(is_valid.shape, np.bool_)  # it mostly takes no memory
+        is_hidden = np.zeros(is_valid.shape, np.bool_)  # zeros mostly take no memory
     focal = cameras[0].camera.focal[0]
     prior = FocalPrior(focal, of_one.deviation, of_one.source, views[0], is_hidden)
     return replace(masked, focal_prior=prior)
 
 
 def panorama_size(path: Path) -> tuple[int, int]:
-    """Return width and height [px] of a file's panorama, not decoded; InputError if EXIF rotates it."""
+    """Return width and height [px] of a file's panorama, not decoded. Raise InputError if EXIF turns it."""
     size, orientation = picture_shape(face_paths(path)["f"] if path.is_dir() else path)
     if path.is_dir():
         return 4 * size[0], 2 * size[0]
@@ -162,7 +162,7 @@ def panorama_size(path: Path) -> tuple[int, int]:
 
 
 def _region_of(photo: Photo, picture: Picture, fields: dict[str, str]) -> tuple[CropRegion, list[str]]:
-    """Return the part of the sphere that a picture shows, by the user or metadata, and warnings."""
+    """Return the part of the sphere that a picture shows, by the options or metadata, and warnings."""
     width, height = picture.size
     if photo.fov_deg is not None:
         notes = [LIKE_A_PHOTO] if photo.projection is None and not fields and _is_like_photo(picture) else []
@@ -196,7 +196,7 @@ def _region_of(photo: Photo, picture: Picture, fields: dict[str, str]) -> tuple[
 
 
 def _unroll(picture: Picture, angle: float) -> Picture:
-    """Return a cylinder's picture, which shows `angle` [rad] across, as a strip of the sphere."""
+    """Return the picture of a cylinder, `angle` [rad] wide, resampled as a strip of the sphere."""
     width, height = picture.size
     radius = width / angle  # [px]
     half = math.atan(height / 2.0 / radius)
@@ -209,13 +209,13 @@ def _unroll(picture: Picture, angle: float) -> Picture:
 
 
 def _is_like_photo(picture: Picture) -> bool:
-    """Return True for a picture of the shape of a camera's photos, upright or not."""
+    """Return True if a picture has the shape of a camera's photos, upright or not."""
     ratio = max(picture.size) / min(picture.size)
     return any(abs(ratio / camera_ratio - 1.0) <= ASPECT_TOLERANCE for camera_ratio in CAMERA_RATIOS)
 
 
 def _embed_and_mask(photo: Photo, picture: Picture, region: CropRegion, attitude: GPano | None) -> Panorama:
-    """Embed the picture in the full sphere, and mask all pixels that do not count."""
+    """Embed the picture in the full sphere, and mask borders, patches and what the user masks."""
     path = photo.path
     size = gpano.full_size(path, region, picture.size)
     notes = [*picture.warnings]
@@ -236,9 +236,9 @@ def _embed_and_mask(photo: Photo, picture: Picture, region: CropRegion, attitude
     return _mask(photo, Panorama(rgb, is_valid, attitude, tuple(notes)), masks.get(0))
 
 
-def _mask(photo: Photo, panorama: Panorama, counts: Mask | None) -> Panorama:
-    """Return the panorama without pixels removed by a mask of its size or the option for the nadir."""
-    is_valid = panorama.is_valid if counts is None else panorama.is_valid & counts
+def _mask(photo: Photo, panorama: Panorama, sphere_mask: Mask | None) -> Panorama:
+    """Return the panorama without the pixels that a mask of its size, or `mask_nadir_deg`, excludes."""
+    is_valid = panorama.is_valid if sphere_mask is None else panorama.is_valid & sphere_mask
     is_valid = mask_pole(is_valid, "nadir", photo.mask_nadir_deg)
     if not is_valid.any():
         raise InputError(f"{photo.path}: no pixel is left: all are masked or black")
@@ -246,7 +246,7 @@ def _mask(photo: Photo, panorama: Panorama, counts: Mask | None) -> Panorama:
 
 
 def _user_masks(path: Path, sizes: list[tuple[int, int]], photo: Photo, notes: list[str]) -> dict[int, Mask]:
-    """Return the user's mask, True where pixels count, by the index of the size whose shape it has."""
+    """Return the user's mask, True for valid pixels, by the index of the size whose shape it has."""
     if photo.mask is None or isinstance(photo.mask, np.ndarray):
         return {}
     file = find_mask(Path(photo.mask), path)
@@ -254,14 +254,14 @@ def _user_masks(path: Path, sizes: list[tuple[int, int]], photo: Photo, notes: l
         notes.append(f"found no mask {path.stem} in {photo.mask}")
         return {}
     is_folder = Path(photo.mask).is_dir()
-    if is_black_ignored := is_folder and file.stem != path.stem:  # a name that COLMAP or Metashape gives
+    if is_black_ignored := is_folder and file.stem != path.stem:  # it is named as by COLMAP or Metashape
         notes.append(f"of the mask {file.name}, black is ignored, as COLMAP and Metashape have it")
-    index, counts = read_mask(file, sizes, is_black_ignored)
-    return {index: counts}
+    index, mask = read_mask(file, sizes, is_black_ignored)
+    return {index: mask}
 
 
 def _sphere_fraction(is_there: Mask, region: CropRegion) -> float:
-    """Return the fraction of the sphere that a part (H, W) of a picture of `region` covers."""
+    """Return the fraction of the sphere that a mask (H, W) of a picture of `region` covers."""
     rows = (np.arange(len(is_there)) + 0.5) / len(is_there) * region.height + region.top
     per_row = is_there.mean(axis=1) * np.sin(np.clip(rows, 0.0, 1.0) * np.pi)
     return float(per_row.mean() * region.width * region.height * np.pi / 2.0)

@@ -1,8 +1,8 @@
-"""The panorama as texels, one int32 a pixel; points are projected to them a chunk at a time.
+"""The panorama as texels, an int32 for each pixel; points are projected to them a chunk at a time.
 
-`project` has two loops: the arithmetic of the first is vectorised, the loads of the second are not. On
-processors that gather slowly that is three times faster (AMD up to Zen 3), and others lose nothing. The
-arrays of a chunk fit the first-level cache.
+`project` has two loops: the arithmetic of the first is vectorised, the loads of the second are not. That is
+three times faster on processors that gather slowly (AMD up to Zen 3), and not slower on others. The arrays of
+a chunk fit into the first-level cache.
 """
 
 import math
@@ -16,7 +16,7 @@ from ...system.arrays import Array32, Bytes, Floats, Int32s, Mask
 from ...system.kernels.jit import F1, HALF, Scalar, inline_kernel, whole
 
 BYTE = np.int32(255)
-TEXEL_CHUNK = 512  # points
+TEXEL_CHUNK = 512  # points of a chunk
 Weights = tuple[Scalar, Scalar, Scalar, Scalar]  # of four texels
 Pose32 = tuple[
     np.float32, np.float32, np.float32, np.float32, np.float32, np.float32,
@@ -25,20 +25,20 @@ Pose32 = tuple[
 
 
 class Texels(NamedTuple):
-    """An equirectangular image for gathering: a column is wrapped and a row clamped on each side."""
+    """An equirectangular image to gather from, padded by a column on each side, which wraps, and by a row."""
 
     rgbx: Int32s  # ((H + 2) * (W + 2),) R, G, B from the lowest byte up, X = 1 where valid
     width: int  # W [px], H = W / 2
-    valid_share: float = 1.0  # of the sphere
+    valid_share: float = 1.0  # fraction of the sphere that is valid
 
     def mirror(self) -> "Texels":
-        """Return the image mirrored left for right."""
+        """Return the image mirrored left to right."""
         rows = self.rgbx.reshape(-1, self.width + 2)
         return self._replace(rgbx=np.ascontiguousarray(rows[:, ::-1]).reshape(-1))
 
 
 def pack_texels(rgb: Bytes, is_valid: Mask | None = None) -> Texels:
-    """Pack an image (H, W, 3), W = 2 H, into texels; those of `is_valid` (H, W) count, all if it is None."""
+    """Pack an image (H, W, 3), W = 2 H, into texels, with a mask (H, W); if that is None, all are valid."""
     height, width = rgb.shape[:2]
     padded = np.empty((height + 2, width + 2), np.int32)
     padded[1:-1, 1:-1] = pack_rgbx(rgb, is_valid)
@@ -49,7 +49,7 @@ def pack_texels(rgb: Bytes, is_valid: Mask | None = None) -> Texels:
 
 
 def find_valid(image: Texels) -> Mask:
-    """Return the mask (H, W) of the pixels that count."""
+    """Return the mask (H, W) of the valid pixels."""
     padded = image.rgbx.reshape(-1, image.width + 2)
     return np.asarray((padded[1:-1, 1:-1] >> 24) & 1 == 1)
 
@@ -62,11 +62,11 @@ def channel(texel: np.int32, shift: int) -> np.float32:
 
 @inline_kernel
 def locate_texel(x: Scalar, y: Scalar, z: Scalar, rho: Scalar, width: int) -> tuple[np.int32, Scalar, Scalar]:
-    """Return the index of the upper left of four texels around a direction, and the fraction beyond it.
+    """Return the index of the upper left of four texels around a direction, and the fractions (fu, fv).
 
-    The direction (x, y, z) is the camera's, rho = hypot(x, y), the fraction (fu, fv). Texel centres are at
-    half-integers of the pixel coordinates, and a column and a row of padding come before them. The indices of
-    the other three are 1, stride and stride + 1 higher.
+    The direction (x, y, z) is in the camera's axes, and rho = hypot(x, y). Fractions are from that texel's
+    centre to the next one's. Texel centres are at half-integers of the pixel coordinates, and a column and a
+    row of padding come before them. The indices of the other three are 1, stride and stride + 1 higher.
     """
     u, v = direction_to_pixel(x, y, z, rho, np.float32(width))
     u, v = u + HALF, v + HALF
@@ -77,13 +77,13 @@ def locate_texel(x: Scalar, y: Scalar, z: Scalar, rho: Scalar, width: int) -> tu
 
 @inline_kernel
 def is_valid(t00: np.int32, t10: np.int32, t01: np.int32, t11: np.int32) -> np.float32:
-    """Return 1 if all four texels count, 0 if one is masked."""
+    """Return 1 if all four texels are valid, 0 if one is masked."""
     return np.float32(((t00 & t10 & t01 & t11) >> 24) & 1)
 
 
 @inline_kernel
 def bilinear_weights(fu: Scalar, fv: Scalar) -> Weights:
-    """Return the weights of the texels (0, 0), (1, 0), (0, 1), (1, 1) at the fraction (fu, fv)."""
+    """Return the weights of the texels (0, 0), (1, 0), (0, 1), (1, 1) at the fractions (fu, fv)."""
     w11 = fu * fv
     w10 = fu - w11
     w01 = fv - w11
@@ -101,7 +101,7 @@ def blend(t00: np.int32, t10: np.int32, t01: np.int32, t11: np.int32, weights: W
 def blend_with_gradient(
     t00: np.int32, t10: np.int32, t01: np.int32, t11: np.int32, fu: Scalar, fv: Scalar, shift: int
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Interpolate one channel of four texels at a fraction; return its derivatives by u and v too."""
+    """Interpolate one channel of four texels; return it and its derivatives by u and v."""
     c00 = channel(t00, shift)
     c10 = channel(t10, shift) - c00
     c01 = channel(t01, shift)
@@ -114,12 +114,12 @@ def blend_with_gradient(
 class Projected(NamedTuple):
     """A chunk of projected points, and the texels around each; arrays (TEXEL_CHUNK,)."""
 
-    x: Array32  # camera coordinates
+    x: Array32  # camera coordinates [m]
     y: Array32
     z: Array32
-    fu: Array32  # fraction beyond the upper left of four texels
+    fu: Array32  # fractions from the upper left of four texels
     fv: Array32
-    texel: Int32s  # index of this texel
+    texel: Int32s  # index of the upper left texel
     t00: Int32s  # the four texels
     t10: Int32s
     t01: Int32s
@@ -128,7 +128,7 @@ class Projected(NamedTuple):
 
 @inline_kernel
 def make_chunk() -> Projected:
-    """Make the arrays of a chunk, not filled."""
+    """Return uninitialised arrays for a chunk."""
     f = np.empty((5, TEXEL_CHUNK), np.float32)
     i = np.empty((5, TEXEL_CHUNK), np.int32)
     return Projected(f[0], f[1], f[2], f[3], f[4], i[0], i[1], i[2], i[3], i[4])
@@ -136,7 +136,7 @@ def make_chunk() -> Projected:
 
 @inline_kernel
 def pose_float32(R_cam_from_world: Floats, center_world: Floats) -> Pose32:
-    """Return a pose's rotation (3, 3), row by row, and centre (3,), as twelve float32 for registers."""
+    """Return a pose's rotation (3, 3), row by row, and centre (3,) as twelve float32, to be in registers."""
     f = np.float32
     R = R_cam_from_world
     t = center_world
@@ -148,7 +148,7 @@ def pose_float32(R_cam_from_world: Floats, center_world: Floats) -> Pose32:
 
 @inline_kernel
 def in_camera(x: Scalar, y: Scalar, z: Scalar, pose: Pose32) -> tuple[Scalar, Scalar, Scalar]:
-    """Transform a point to camera coordinates, by a pose of `pose_float32`."""
+    """Transform a point to camera coordinates by a pose from `pose_float32`."""
     r00, r01, r02, r10, r11, r12, r20, r21, r22, tx, ty, tz = pose
     dx, dy, dz = x - tx, y - ty, z - tz
     return (r00 * dx + r01 * dy + r02 * dz, r10 * dx + r11 * dy + r12 * dz, r20 * dx + r21 * dy + r22 * dz)
@@ -165,7 +165,7 @@ def project(
     width: int,
     projected: Projected,
 ) -> None:
-    """Write camera coordinates of a chunk of points (n,), and their places in an image with the texels."""
+    """Write the camera coordinates of a chunk of points (n,), and the texels of an image around each."""
     p = projected
     pose = pose_float32(R_cam_from_world, center_world)
     for n in range(len(X)):
@@ -188,7 +188,7 @@ def project(
 
 @inline_kernel
 def sample(projected: Projected, n: int) -> tuple[Scalar, Scalar, Scalar, np.float32]:
-    """Interpolate the three channels [levels] at a projected point; return also 1 if all texels count."""
+    """Return the three channels [levels] at a projected point, and 1 if all of its texels are valid."""
     p = projected
     weights = bilinear_weights(p.fu[n], p.fv[n])
     t00, t10, t01, t11 = p.t00[n], p.t10[n], p.t01[n], p.t11[n]

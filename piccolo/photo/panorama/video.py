@@ -1,4 +1,4 @@
-"""Videos: their frames as picture files, the sharpest around each time step."""
+"""Videos: frames written as picture files, the sharpest around each time step."""
 
 from collections.abc import Collection, Iterator, Sequence
 from itertools import pairwise
@@ -13,23 +13,23 @@ from ...system.errors import InputError, import_optional
 from ...system.files.atomic import write_temporary
 from ...system.jobs.memory import check_memory
 
-SHARPNESS_WIDTH = 512  # [px] at which sharpness is judged
-NEIGHBORHOOD = 0.25  # of a step, before and after its time, in which the sharpest frame is taken
-DISTINCT_SIZE = 32, 18  # [px] at which it is judged how much a picture changes
+SHARPNESS_WIDTH = 512  # [px] at which sharpness is measured
+NEIGHBORHOOD = 0.25  # of a step, before and after its time, in which the sharpest frame is chosen
+DISTINCT_SIZE = 32, 18  # [px] at which the change between frames is measured
 FRAME_QUALITY = 95  # of the JPEG files
-FRAME_BYTES_PER_PIXEL = 20  # of frames in several stages of decoding; 19 were measured
+FRAME_BYTES_PER_PIXEL = 20  # of memory for frames in several stages of decoding; 19 were measured
 WANTED = "wanted a video that PyAV reads, such as MP4"
 
 
 class VideoFrame(NamedTuple):
     """A frame of a video, written as a picture."""
 
-    time: float  # [s] from its beginning
-    path: Path  # of the picture
+    time: float  # [s] from the beginning of the video
+    path: Path  # of the picture file
 
 
 def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
-    """Write and yield the sharpest frame around each time step [s]; InputError for what is no video."""
+    """Write and yield the sharpest frame around each step of `every` [s]. InputError if it is no video."""
     best: tuple[float, float, Bytes] | None = None  # sharpness, time, RGB
     slot = 0
     for time, frame in _decode(video):
@@ -50,12 +50,12 @@ def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
 def frames_of_chapters(
     videos: Sequence[Path], every: float, folder: Path
 ) -> Iterator[tuple[Path, VideoFrame, float]]:
-    """Yield the video of each frame, the frame, and its time [s] in chapters that follow one another."""
+    """Yield each frame's video, the frame, and its time [s] from the beginning of the first video."""
     if twice := [video for video in videos if videos.count(video) > 1]:
         raise InputError(f"{twice[0]}: found it twice, wanted each chapter once")
     begin = 0.0
     for number, video in enumerate(videos):
-        own = folder / str(number)  # chapters of two folders may have one name
+        own = folder / str(number)  # chapters in different folders may have the same name
         own.mkdir()
         for frame in frames_of(video, every, own):
             yield video, frame, begin + frame.time
@@ -63,7 +63,7 @@ def frames_of_chapters(
 
 
 def frames_at(video: Path, times: Collection[float], folder: Path) -> Iterator[VideoFrame]:
-    """Write the frames at times [s], in whole milliseconds, into a folder, and yield them."""
+    """Write the frames at times [s], which are compared in milliseconds, into a folder, and yield them."""
     left = {round(1000.0 * time) for time in times}
     for time, frame in _decode(video) if left else ():
         if round(1000.0 * time) in left:
@@ -74,33 +74,33 @@ def frames_at(video: Path, times: Collection[float], folder: Path) -> Iterator[V
 
 
 def choose_distinct(frames: Sequence[Path], most: int) -> list[int]:
-    """List the numbers of frames between which the picture changes about evenly, `most` of them or fewer.
+    """Return the indices of at most `most` frames between which the picture changes about equally.
 
-    The first and the last are among them; where a camera stands still, or waits, there are few.
+    The first and the last are among them. While the camera stands still, few are chosen.
     """
     if len(frames) <= most:
         return list(range(len(frames)))
-    shown = (np.asarray(cv2.imread(str(frame), cv2.IMREAD_REDUCED_GRAYSCALE_8)) for frame in frames)
-    small = [cv2.resize(gray, DISTINCT_SIZE, interpolation=cv2.INTER_AREA).astype(float) for gray in shown]
+    grays = (np.asarray(cv2.imread(str(frame), cv2.IMREAD_REDUCED_GRAYSCALE_8)) for frame in frames)
+    small = [cv2.resize(gray, DISTINCT_SIZE, interpolation=cv2.INTER_AREA).astype(float) for gray in grays]
     along = np.cumsum([0.0, *(np.abs(after - before).mean() for before, after in pairwise(small))])
     return sorted({int(np.abs(along - at).argmin()) for at in np.linspace(0.0, along[-1], most)})
 
 
 def measure_sharpness(rgb: Bytes) -> float:
-    """Return the variance of a small copy's Laplacian (Pech-Pacheco et al., 2000) of an image (H, W, 3)."""
+    """Return the variance of the Laplacian of an image (H, W, 3), made small (Pech-Pacheco et al., 2000)."""
     height = max(round(rgb.shape[0] * SHARPNESS_WIDTH / rgb.shape[1]), 1)
     small = cv2.resize(rgb, (SHARPNESS_WIDTH, height), interpolation=cv2.INTER_AREA)
     return float(cv2.Laplacian(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), cv2.CV_32F).var())
 
 
 def _upright(frame: Any) -> Bytes:
-    """Return the RGB (H, W, 3) of a frame, turned as players show it; phones store it as the sensor lies."""
+    """Return the RGB (H, W, 3) of a frame, turned as players show it; phones store it unturned."""
     rgb = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
     return np.ascontiguousarray(np.rot90(rgb, round(frame.rotation / 90)))
 
 
 def _decode(video: Path) -> Iterator[tuple[float, Any]]:
-    """Yield times [s] from the first frame, and the frames as PyAV returns them."""
+    """Yield the frames as PyAV returns them, each after its time [s] from the first frame."""
     av = import_optional(video, "av", "video")
     begin: float | None = None
     try:
@@ -129,7 +129,7 @@ def _decode(video: Path) -> Iterator[tuple[float, Any]]:
 
 
 def _measure_length(video: Path) -> float:
-    """Return the length [s] of a video that has been read."""
+    """Return the length [s] of a video that can be read."""
     av = import_optional(video, "av", "video")
     with av.open(str(video)) as container:
         stream = container.streams.video[0]
