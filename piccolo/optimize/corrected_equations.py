@@ -38,10 +38,10 @@ def write_free_equations(
     gradients: Array,
     matrices: Array,
 ) -> None:
-    """Write the sums of `FreeSums` for points in the camera's axes; p corrections have `moves` (p, 3, N).
+    """Write the sums of `FreeSums` for points in the camera's axes, and their moves (p, 3, N) by corrections.
 
-    Only the upper triangle of each matrix is written. Part k is the points from begins[k] to begins[k + 1].
-    Points on masked pixels add nothing.
+    Of each matrix the upper triangle is written. Part k is the points from begins[k] to begins[k + 1]. Points
+    on masked pixels add nothing.
     """
     points, channels, weights, texels, width, scale = problem
     n = NUM_OF_POSE + len(moves)

@@ -61,7 +61,7 @@ class DifferenceSteps(NamedTuple):
     """Image and step with which the loss is differentiated for a covariance."""
 
     image: ImageName  # of the photo
-    turn: float  # [rad] step of rotations; that of translations is this times the median range
+    turn: float  # [rad] step of the differences; a move is this times the median range
     inflation: float  # so that 95 % of true poses lie in the 95 % region (tools/benchmark.py calibration)
 
 
@@ -104,7 +104,7 @@ class Profile:
     # the refinement
     beam: Beam = WHOLE_BEAM
     first: Stage = FIRST  # the short descent from each start
-    refines_on_matches: bool = False  # candidates with many matches are also refined on them
+    refines_on_matches: bool = False  # at candidates with many matches, a pose is refined on them
     soft: tuple[Stage, ...] = ()  # stages before the first descent on points
     settles_near: bool = False  # a descent near a given pose is slow: it goes on with occluders masked
     # the choice
@@ -114,11 +114,11 @@ class Profile:
     most_rivals: int | None = 4
     discount: float = 1.0  # factor of scores by shape: on few blocks chance explains more
     # geometry and errors
-    fits_sphere: bool = True  # the part of the sphere that a panorama says to show is fitted to the scan
-    steps: tuple[DifferenceSteps, ...] = COLOR_STEPS  # the covariance is the mean of those by these
-    rough_steps: DifferenceSteps = ROUGH_COLOR_STEPS  # if the loss is too rough for all of these
-    own_share: float = 1.0  # of the variance by images that is this photo's own, not common to all
-    has_few_blocks: bool = False  # by which a covariance is too small in the mean: it is enlarged
+    fits_sphere: bool = True  # what a panorama shows of the sphere is compared with the scan
+    steps: tuple[DifferenceSteps, ...] = COLOR_STEPS  # of a covariance, which is the mean by these
+    rough_steps: DifferenceSteps = ROUGH_COLOR_STEPS  # if all of these are too rough
+    own_share: float = 1.0  # of the variance by images: errors that other photos do not have in common
+    has_few_blocks: bool = False  # so that their covariance is too small in the mean
     compares_halves: bool = True  # a covariance grows if the halves of a badly stitched photo disagree
 
     @property

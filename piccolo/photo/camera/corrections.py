@@ -171,10 +171,9 @@ def displace_in_pinhole(
     moves: Array32,
     is_shown: Array32,
 ) -> None:
-    """Write points (3, N) [m] displaced in a pinhole by corrections (5,), and derivatives (5, 3, N).
+    """Write where points (3, N) are seen by a pinhole with corrections (5,), and derivatives (5, 3, N).
 
-    A ray is u = q / |q| with q = (1, -x, -y), and changes by (I - u u^T) dq / |q|. A point that is not in
-    front of the lens (`least_ahead`, the least cosine to the axis) stays where it is.
+    A ray is u = q / |q|, q = (1, -x, -y), and moves by (I - u u^T) dq / |q|. What is not ahead stays.
     """
     R = R_lens_from_cam
     wide = np.float32(math.exp(values[0]))
