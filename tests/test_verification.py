@@ -81,7 +81,7 @@ def test_what_moves_with_the_camera_is_no_match():
     """A photo matched with itself: of what is left, nothing is where the pose puts it."""
     own = verification.place_keypoints(narrow_photo.problem(), narrow_photo.true_pose(), WORKERS)
     matches = verification.match_beside(narrow_photo.problem(), own, WORKERS)
-    assert len(matches.query) < 0.2 * len(narrow_photo.problem().photo.seen(WORKERS).keypoints.rays)
+    assert len(matches.query) < 0.2 * len(narrow_photo.problem().photo.features(WORKERS).keypoints.rays)
     assert count_inliers(matches, narrow_photo.true_pose(), METHOD.cos_agree) == 0
 
 
@@ -91,7 +91,7 @@ def test_a_mirrored_photo_has_no_matches_beside():
         narrow_photo.take()[0].rgb[:, ::-1].copy(), narrow_photo.take()[0].is_valid[:, ::-1].copy()
     )
     mirrored = rooms.ask(taken, rooms.scan_map(1, narrow_photo.NUM_POINTS), rooms.UNKNOWN)
-    own = mirrored.photo.seen(WORKERS).keypoints
+    own = mirrored.photo.features(WORKERS).keypoints
     assert len(matching.match_pictures(own, narrow_photo.beside().keypoints)[0]) > 0
     assert verification.match_beside(mirrored, narrow_photo.beside(), WORKERS) is NO_MATCHES
 
@@ -190,7 +190,7 @@ def test_keypoints_on_what_the_scan_does_not_show_are_left_out():
     given = Panorama(rgb, panorama.is_valid)
     occluded = rooms.ask(given, rooms.scan_map(1, narrow_photo.NUM_POINTS), rooms.UNKNOWN)
     for asked, least, most in ((narrow_photo.problem(), 0.5, 1.0), (occluded, 0.0, 0.1)):
-        seen = asked.photo.seen(WORKERS).keypoints.rays
+        seen = asked.photo.features(WORKERS).keypoints.rays
         kept = verification.place_keypoints(asked, narrow_photo.true_pose(), WORKERS).keypoints.rays
         num_seen, num_kept = (
             hidden[compute_indices(rays, narrow_photo.WIDTH)].sum() for rays in (seen, kept)
@@ -292,7 +292,9 @@ def test_the_scan_is_drawn_once_for_each_pose_of_the_grid():
         key, drawn_at = verification.round_pose(other)
         assert drawn.key == key != known.key
         picture = verification.find_all_drawn(narrow_photo.problem(), drawn_at, WORKERS)
-        expected = verification.match_located(narrow_photo.problem().photo.seen(WORKERS).keypoints, picture)
+        expected = verification.match_located(
+            narrow_photo.problem().photo.features(WORKERS).keypoints, picture
+        )
         np.testing.assert_array_equal(drawn.matches.points, expected.points)
 
 
@@ -342,7 +344,7 @@ def test_half_a_metre_off_the_matches_are_those_of_the_true_pose(offset):
 
 def test_the_scan_is_drawn_for_whole_photos_too_but_not_for_whole_views_alone():
     whole = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1, narrow_photo.NUM_POINTS), rooms.UNKNOWN)
-    assert len(whole.photo.seen(WORKERS).views) == 4
+    assert len(whole.photo.features(WORKERS).views) == 4
     assert _count(whole, narrow_photo.true_pose()) > 20
     assert _count(whole, _moved((1.0, 0.5, 0.0))) < 6
     found = make_selection(examine(whole, narrow_photo.true_pose()))

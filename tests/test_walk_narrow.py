@@ -127,9 +127,9 @@ def test_photos_beside_support_a_narrow_photo_where_they_agree(seen):
     taken = tracked.narrow(problem)
     here = examine(taken, true)
     alone = near.assess_end(taken, here, WORKERS).num_matches
-    more = taken.photo.seen(WORKERS).keypoints.take(np.arange(2 * alone))
+    more = taken.photo.features(WORKERS).keypoints.take(np.arange(2 * alone))
     located = verification.Located(more, np.full(2 * alone, 2.0, np.float32), true)
-    others = verification.match_located(taken.photo.seen(WORKERS).keypoints, located)
+    others = verification.match_located(taken.photo.features(WORKERS).keypoints, located)
     assert near.assess_end(replace(taken, beside=(others,)), here, WORKERS).num_matches > alone
     away = others._replace(points=others.points + np.float32(0.5))
     assert near.assess_end(replace(taken, beside=(away,)), here, WORKERS).num_matches == alone
@@ -140,7 +140,7 @@ def confirmed(seen):
     """The problem of a narrow photo beside one that shows the same; and the pose of that, exact to 5 mm."""
     taken = tracked.narrow(seen[0])
     located = verification.place_keypoints(taken, seen[1], WORKERS)
-    matches = verification.match_located(taken.photo.seen(WORKERS).keypoints, located)
+    matches = verification.match_located(taken.photo.features(WORKERS).keypoints, located)
     exact = PoseGaussian(seen[1], np.diag(np.repeat([0.001**2, 0.005**2], 3)), np.zeros((6, 6)))
     return replace(taken, beside=(matches,)), exact
 

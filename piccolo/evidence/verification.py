@@ -103,7 +103,7 @@ def draw_near(problem: Problem, pose: Pose, known: Drawn | None, workers: Worker
     if known is not None and known.key == key:
         return known
     picture = find_all_drawn(problem, drawn_at, workers)
-    return Drawn(key, match_located(problem.photo.seen(workers).keypoints, picture))
+    return Drawn(key, match_located(problem.photo.features(workers).keypoints, picture))
 
 
 def round_pose(pose: Pose) -> tuple[bytes, Pose]:
@@ -116,7 +116,7 @@ def round_pose(pose: Pose) -> tuple[bytes, Pose]:
 
 def find_all_drawn(problem: Problem, pose: Pose, workers: Workers) -> Located:
     """Draw the scan as the photo would show it at a pose in the map; return the keypoints of the drawing."""
-    parts = workers.map(partial(find_drawn, problem, pose), problem.photo.seen(workers).views, "draw")
+    parts = workers.map(partial(find_drawn, problem, pose), problem.photo.features(workers).views, "draw")
     ranges = np.concatenate([ranges for _, ranges in parts])
     return Located(join_keypoints([keypoints for keypoints, _ in parts]), ranges, pose)
 
@@ -142,7 +142,7 @@ def find_ranges(problem: Problem, pose: Pose, workers: Workers) -> Array32:
 
     Keypoints on things that the scan does not show, as people and moved furniture, have the range 0.
     """
-    views, keypoints = problem.photo.seen(workers)
+    views, keypoints = problem.photo.features(workers)
     panorama = problem.photo.panorama
     mask = occlusion_mask(problem.surroundings_at(pose)[0], panorama, pose)
     ranges = np.zeros(len(keypoints.rays), np.float32)
@@ -157,7 +157,7 @@ def place_keypoints(problem: Problem, pose: Pose, workers: Workers) -> Located:
     """Return the keypoints of a photo that was taken at a pose in the map, if the scan gives them a range."""
     ranges = find_ranges(problem, pose, workers)
     is_seen = np.flatnonzero(ranges > 0.0)
-    return Located(problem.photo.seen(workers).keypoints.take(is_seen), ranges[is_seen], pose)
+    return Located(problem.photo.features(workers).keypoints.take(is_seen), ranges[is_seen], pose)
 
 
 def match_beside(problem: Problem, other: Located, workers: Workers) -> Matches:
@@ -166,7 +166,7 @@ def match_beside(problem: Problem, other: Located, workers: Workers) -> Matches:
     Keypoints that both have in the same direction are left out: they may be carried along, as dirt on a lens
     is. No matches are returned if the mirrored photo has more.
     """
-    own = problem.photo.seen(workers).keypoints
+    own = problem.photo.features(workers).keypoints
     mine, theirs = match_pictures(own, other.keypoints)
     if len(mine) < LEAST_MATCHES or len(match_pictures(own.mirror(), other.keypoints)[0]) > len(mine):
         return NO_MATCHES

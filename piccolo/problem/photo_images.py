@@ -44,7 +44,7 @@ class Images(NamedTuple):
     search: Once[Texels]  # for prepared views
 
 
-class Seen(NamedTuple):
+class PhotoFeatures(NamedTuple):
     """Perspective views that together show all of a photo, and the keypoints found in them."""
 
     views: list[PerspectiveView]
@@ -58,7 +58,7 @@ class PhotoImages:
     panorama: Panorama  # at the width at which keypoints are found
     images: Images
     small: Texels  # colours, not normalised, at the size of the fine image; poses are scored by it
-    seen: Once[Seen]  # compared with the scan drawn at a pose; called with the workers
+    features: Once[PhotoFeatures]  # compared with the scan drawn at a pose; called with the workers
     cone: Once[Cone]  # around what the photo shows, in the camera's axes
     R_cam_from_level: Array  # (3, 3) tilt of the camera; the identity if it is not known
     has_tilt: bool  # True if R_cam_from_level is known, from metadata or a gravity vector
@@ -105,7 +105,7 @@ class PhotoImages:
             panorama=panorama,
             images=Images(*(Once(Texels.mirror, image) for image in self.images)),
             small=small,
-            seen=Once(find_seen, panorama, small),
+            features=Once(find_features, panorama, small),
             cone=Once(find_cone, small, 0.0),
             R_cam_from_level=MIRROR @ self.R_cam_from_level @ MIRROR,
         )
@@ -126,10 +126,10 @@ def make_photo(
     panorama = resize(panorama, scales.full.width)
     fine = reduce(panorama, scales.fine)
     small = pack_texels(fine.rgb, fine.is_valid)
-    seen = Once(find_seen, panorama, small)
+    features = Once(find_features, panorama, small)
     images = make_images(panorama, scales)
     cone = Once(find_cone, small, 0.0)
-    return PhotoImages(panorama, images, small, seen, cone, R_cam_from_level, has_tilt, scales)
+    return PhotoImages(panorama, images, small, features, cone, R_cam_from_level, has_tilt, scales)
 
 
 def make_images(panorama: Panorama, scales: ImageScales) -> Images:
@@ -147,7 +147,7 @@ def reduce(panorama: Panorama, scale: ImageScale) -> Panorama:
     return resize(soften(panorama, scale.blur_px) if scale.blur_px else panorama, scale.width)
 
 
-def find_seen(panorama: Panorama, small: Texels, workers: Workers) -> Seen:
+def find_features(panorama: Panorama, small: Texels, workers: Workers) -> PhotoFeatures:
     """Find the keypoints of a photo, in one view around what it shows or, if that is too wide, in several.
 
     The views of a whole photo are those to its sides, without above and below.
@@ -159,13 +159,13 @@ def find_seen(panorama: Panorama, small: Texels, workers: Workers) -> Seen:
     mask = add_margin(panorama.is_valid)
     views = [view for view in views if view.cut_mask(mask).any()]
     gray = np.asarray(cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
-    return Seen(views, find_keypoints(gray, panorama.is_valid, views, workers))
+    return PhotoFeatures(views, find_keypoints(gray, panorama.is_valid, views, workers))
 
 
 def find_all_around(photo: PhotoImages, workers: Workers) -> Keypoints:
     """Find a photo's keypoints in all directions, for a whole photo also above and below."""
     if photo.is_partial:
-        return photo.seen(workers).keypoints
+        return photo.features(workers).keypoints
     panorama = photo.panorama
     gray = np.asarray(cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
     return find_keypoints(gray, panorama.is_valid, cover_sphere(panorama.rgb.shape[1]), workers)

@@ -80,7 +80,7 @@ def list_keypoints(scan_map: ScanMap, photo: Known, workers: Workers, watch: Sto
     if problem is None or not problem.profile.uses_matches:
         return None
     with watch.stage("match"):
-        return problem.photo.seen(workers).keypoints
+        return problem.photo.features(workers).keypoints
 
 
 def list_matched(keypoints: Mapping[int, Keypoints | None], unsure: set[int], workers: Workers) -> list[int]:

@@ -99,7 +99,7 @@ class Links:
 
 def find_links(problems: Mapping[int, Problem], workers: Workers) -> Links:
     """Match the photos with each other; if they are many, each with those that look most like it."""
-    keypoints = {number: problem.photo.seen(workers).keypoints for number, problem in problems.items()}
+    keypoints = {number: problem.photo.features(workers).keypoints for number, problem in problems.items()}
     return Links(problems, keypoints, match_each(keypoints, workers), workers)
 
 
