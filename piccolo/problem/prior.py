@@ -1,4 +1,4 @@
-"""What the user knows of a photo's pose leaves fewer positions and rotations to search."""
+"""The user's prior knowledge of a photo's pose, which leaves fewer positions and rotations to search."""
 
 import numpy as np
 

@@ -58,7 +58,7 @@ class Spelling(NamedTuple):
 
 
 class Fields(NamedTuple):
-    """What the beginning of a text file tells about its lines of numbers."""
+    """The layout of a text file's lines of numbers, as its beginning tells it."""
 
     start: int  # [byte] of the first line of numbers
     num_lines: int  # before that line
