@@ -188,6 +188,10 @@ def test_resolution_is_the_focal_length():
         (("SIMPLE_PINHOLE", 10, 10, (-5.0, 2.0, 3.0)), "found a focal length of -5 px, wanted at least 1"),
         (("SIMPLE_PINHOLE", 0, 10, (5.0, 2.0, 3.0)), "found a camera of 0 x 10"),
         (("FOV", 10, 10, (5.0, 5.0, 2.0, 3.0, 0.0)), "found omega 0 of the model FOV"),
+        (
+            ("OPENCV", 10, 10, (5.0, 5.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1001.0)),
+            "found p2 1001 of the model OPENCV",
+        ),
         (("SIMPLE_PINHOLE", 10, 10, (5.0, 2.0, 3.0), 190.0), "found max_angle_deg 190, wanted above 0"),
     ],
 )

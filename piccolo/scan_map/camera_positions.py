@@ -184,11 +184,9 @@ def candidate_centers(octree: Octree, workers: Workers, within: Ball | Box | Non
     is_tight = (clearance < NEAR_SURFACE) & (is_enclosed | ~is_free)
     kept = middle[~is_tight & is_free & is_enclosed]
 
-    # Cells are split if their corners may be clear; with these constants those of all cells may.
     half = COARSE_SPACING / 2
     corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
-    is_split = is_tight & (clearance + 0.87 * COARSE_SPACING > MIN_CLEARANCE)
-    finer = (2 * cells[is_split][:, None] + corners).reshape(-1, 3)
+    finer = (2 * cells[is_tight][:, None] + corners).reshape(-1, 3)
     middle = (finer + 0.5) * half
     clearance = nearest_distances(tree, middle, workers)
     middle = middle[clearance > MIN_CLEARANCE]

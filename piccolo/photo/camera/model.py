@@ -64,6 +64,8 @@ RADIAL = "k1"
 MAX_PERSPECTIVE = math.radians(89.9)  # half angle that a plane can show
 MAX_ASPECT_ERROR = 0.01  # relative, between a picture and its calibration at another size
 MAX_CAMERA_NUMBER = 1e6
+MOST_OFF_AXIS = 1e3  # of a coefficient whose effect is not radial; beyond, pixels are not exact
+OFF_AXIS = "p1", "p2", "sx1", "sy1"
 MIN_FOCAL = 1.0  # [px]
 TABLE_SIZE = 4096  # angles at which the radial part is tabulated, for the start of Newton's method
 SMALL = 1e-4  # [rad] from the axis, over which the resolution is measured
@@ -196,8 +198,16 @@ class Camera:
             raise InputError(f"found a focal length of {min(self.focal):g} px, wanted at least {MIN_FOCAL:g}")
         if not 1e-4 <= self._named.get("omega", 1.0) < math.pi:
             raise InputError(f"found omega {self._named['omega']:g} of the model FOV, wanted 0.0001 to 3.14")
+        self._check_off_axis()
         if self.max_angle_deg is not None and not 0.0 < self.max_angle_deg <= 180.0:
             raise InputError(f"found max_angle_deg {self.max_angle_deg:g}, wanted above 0 and at most 180")
+
+    def _check_off_axis(self) -> None:
+        """Raise InputError for a coefficient with which pixels would not be exact."""
+        for name in OFF_AXIS:
+            if abs(value := self._named.get(name, 0.0)) > MOST_OFF_AXIS:
+                wanted = f"wanted {-MOST_OFF_AXIS:g} to {MOST_OFF_AXIS:g}"
+                raise InputError(f"found {name} {value:g} of the model {self.model}, {wanted}")
 
     @property
     def lens(self) -> str:
