@@ -99,7 +99,7 @@ def count_deviations(estimate: LensEstimate) -> float:
     return float((np.abs(estimate.by_picture.values) / np.sqrt(CLAIM.deviations**2 + variances)).max())
 
 
-def list_starts() -> list[Array]:
+def list_geometries() -> list[Array]:
     """List the corrections (3,) from which descents begin: of the width alone, or of height and horizon."""
     starts = [np.array([width, 0.0, 0.0]) for width in WIDTH_STARTS]
     for height, share in itertools.product(HEIGHT_STARTS, HORIZONS):
@@ -123,5 +123,5 @@ def search_geometry(problem: Problem, pose: Pose, claimed: Camera, workers: Work
         fine = problem.view_at(end.pose, "fine")
         return descend_freely(fine, problem.photo.image("fine"), freedom, end.pose, end.values, FINE_LIMITS)
 
-    ends = sorted(workers.map(begin, list_starts(), "fit the panorama"), key=lambda end: end.loss)
+    ends = sorted(workers.map(begin, list_geometries(), "fit the panorama"), key=lambda end: end.loss)
     return min(workers.map(go_on, ends[:NUM_ENDS], "fit the panorama"), key=lambda end: end.loss)
