@@ -27,12 +27,12 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # worker runs what compiles most kernels, and the other what needs none, so that none is compiled twice.
 SLOWEST = (
     "test_documents.py", "test_panorama_formats.py", "test_cloud_damage.py", "test_cloud_e57.py",
-    "test_tools.py", "test_three_doors.py", "test_coloring.py", "test_group_command.py", "test_service.py",
-    "test_walk.py", "test_shape.py", "test_killed.py", "test_focal_length.py", "test_scan_formats.py",
-    "test_report.py", "test_bundle.py", "test_batch_second_look.py", "test_cluster.py",
-    "test_localization.py", "test_jobs.py", "test_localize.py", "test_group.py", "test_verification.py",
-    "test_start.py", "test_batch.py", "test_align_gravity.py", "test_service_connections.py",
-    "test_attempts.py", "test_scan_addition.py", "test_doors.py", "test_service_access.py",
+    "test_tools.py", "test_three_doors.py", "test_group_command.py", "test_service.py", "test_shape.py",
+    "test_walk.py", "test_bundle.py", "test_group.py", "test_killed.py", "test_focal_length.py",
+    "test_localization.py", "test_coloring.py", "test_batch.py", "test_attempts.py", "test_scan_formats.py",
+    "test_report.py", "test_doors.py", "test_batch_second_look.py", "test_cluster.py", "test_jobs.py",
+    "test_localize.py", "test_verification.py", "test_start.py", "test_align_gravity.py",
+    "test_service_connections.py", "test_scan_addition.py", "test_service_access.py",
     "test_localize_cameras.py", "test_camera_tools.py",
 )  # fmt: skip
 

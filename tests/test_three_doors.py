@@ -107,6 +107,7 @@ def test_photos_of_one_camera(photos, tmp_path):
 
 
 def test_a_bundle_a_walk_and_a_colouring(tmp_path, coarse_colors, monkeypatch):
+    """One round of colours tells doors apart as well as two."""
     monkeypatch.setattr(painting, "NUM_COLORING_ROUNDS", 1)
     cloud = rooms.write_cloud(tmp_path / "scan.ply", 1, 20_000)
     queries = [rooms.query(1, index=k, width=256) for k in range(2)]
