@@ -230,7 +230,7 @@ def test_the_same_place_by_another_focal_length_is_no_alternative_and_none_is_li
 def test_the_first_sure_guess_ends_the_search(is_blank):
     rgb, _ = _photo(pinhole(320, 240, TRUE))
     panorama = _panorama(np.full_like(rgb, 128) if is_blank else rgb, focal_px=TRUE, refine_focal=True)
-    scan_map = rooms.scan_map(SEED) if is_blank else rooms.scan_map(SEED, DENSE)
+    scan_map = rooms.scan_map(SEED, DENSE)
     means = rooms.means(rooms.KNOWN)
     found = module.localize_guessed(scan_map, panorama, rooms.KNOWN, means)
     num_searched = [made["step"] for made in means.trace.steps].count("refined")
