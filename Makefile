@@ -31,6 +31,9 @@ demo: $(VENV)/ready
 	$(BIN)/python tools/report.py --results demo/poses.jsonl --cloud examples/flat/cloud.ply --out demo/report --plan demo/plan.png --title "Sample flat"
 	@echo "Done: open demo/report/index.html in a browser; demo/overlay.png compares one photo with the scan."
 
+# or each worker, and each process that tests start, compiles all sources anew
+unexport PYTHONDONTWRITEBYTECODE
+
 # each core has a process: further threads of libraries only wait for a core, and take a tenth more time
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 OPENCV_FOR_THREADS_NUM=1
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --max-worker-restart 0

@@ -16,8 +16,13 @@ PAPER = ["--preset", "paper", "num_translations=4", "num_iterations=5", "max_poi
 
 # by which photos that colour the scan of a room are aligned and compared
 COARSE = {
-    "alignment": {"LEAST_ALIGNED_POINTS": 5000, "POINTS_PER_PHOTO": 0, "ALIGNMENT_WIDTHS": (512, 1024)},
-    "passersby": {"VOTE_WIDTH": 128},
+    "alignment": {
+        "LEAST_ALIGNED_POINTS": 5000,
+        "POINTS_PER_PHOTO": 0,
+        "ALIGNMENT_WIDTHS": (512, 1024),
+        "SIGHT_WIDTH": 512,
+    },
+    "passersby": {"VOTE_WIDTH": 128, "LEAST_VOTING_POINTS": 50_000},
 }
 # localize.py with these values
 COARSELY = f"""

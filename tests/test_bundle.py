@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import rooms
 from made_up import PROBLEM, at, make_candidate
+from once import search_alone_once
 from poses import tilted_poses
 
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors, yaw_rotation
@@ -23,7 +24,7 @@ from piccolo.photo.panorama import Panorama
 from piccolo.poses import bundle_adjustment
 from piccolo.poses.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
 from piccolo.system.jobs.threads import Stopwatch, Workers
-from piccolo.together import bundle_search
+from piccolo.together import bundle_search, members
 from piccolo.together.bundle import (
     NOT_FOUND,
     UNSEEN,
@@ -33,6 +34,7 @@ from piccolo.together.bundle import (
     localize_bundle,
     merge_places,
 )
+from piccolo.together.members import Shot
 
 TIER = "scene"
 
@@ -40,6 +42,13 @@ NEAR = np.array([2.0, -1.0, 0.5])
 SEED = 5
 ERRORS = RelativeErrors()
 WHERE = (4, 1, 7)  # eighths of a turn; the first alone is not sure
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _searched_once():
+    with pytest.MonkeyPatch.context() as patch:
+        search_alone_once(patch, by_threads=True)
+        yield
 
 
 def _support(odds, elsewhere=0.0, is_found=True):
@@ -273,7 +282,8 @@ def _bits(found):
 def test_photos_are_localized_together_of_which_one_is_not_alone():
     (narrow,) = rooms.take_photos(SEED, 35.0, {2: np.random.default_rng(2).uniform(-0.3, 0.3, 3)})
     photos, poses = zip(narrow, *_taken(SEED, (1, 7)), strict=True)
-    alone = rooms.locate(photos[0], rooms.scan_map(SEED), rooms.KNOWN)
+    shot = Shot(photos[0], rooms.KNOWN)
+    alone = members.find_alone(rooms.scan_map(SEED), shot, rooms.WORKERS, Stopwatch()).alone
     assert alone.status == "not_localized"
     assert pose_errors(alone.best_pose, poses[0])[0] > 1.0
     found = _together(photos, _relative(poses))

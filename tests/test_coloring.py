@@ -45,6 +45,7 @@ TIER = "scene"
 
 SEED = 1
 NUM_POINTS = 60_000
+NUM_IN_FILE = 20_000  # points, where the command is tested
 WIDTH = 512
 
 pytestmark = pytest.mark.usefixtures("coarse_colors")
@@ -290,10 +291,10 @@ def test_a_file_that_is_not_finished_is_closed(tmp_path, monkeypatch, suffix):
 def files(tmp_path_factory):
     """Options of a scan in a file and its cache, and two photos of it."""
     folder = tmp_path_factory.mktemp("coloring")
-    cloud = rooms.write_cloud(folder / "scan.ply", SEED, NUM_POINTS)
+    cloud = rooms.write_cloud(folder / "scan.ply", SEED, NUM_IN_FILE)
     photos = [str(folder / f"photo {k}.png") for k in range(2)]
     for k, path in enumerate(photos):
-        cv2.imwrite(path, rooms.query(SEED, index=k, width=WIDTH).rgb[..., ::-1])
+        cv2.imwrite(path, rooms.query(SEED, index=k, width=WIDTH // 2).rgb[..., ::-1])
     return ["--cloud", cloud, "--cache", str(folder / "cache")], photos
 
 
@@ -321,7 +322,7 @@ def test_the_commands_colour_a_scan(files, whole, tmp_path, capsys):
     lines.write_bytes(whole.with_suffix(".jsonl").read_bytes())
     assert tool.main([*cloud, "--results", str(lines), "--out", str(again)]) == 0
     assert json.loads(capsys.readouterr().out)["photos"] == 2
-    assert len(read_cloud(again).points) == NUM_POINTS
+    assert len(read_cloud(again).points) == NUM_IN_FILE
     assert command_line.main(_words(files, whole)) == 0
     assert "nothing is left to do" in capsys.readouterr().err
     lines.write_text(lines.read_text().splitlines()[0] + "\n")

@@ -10,6 +10,7 @@ import pytest
 import rooms
 from groups import SEED, taken_photos
 from made_up import make_candidate
+from once import search_alone_once
 
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian
@@ -21,7 +22,7 @@ from piccolo.judge.selection import are_mirrored
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.photo.panorama import Panorama
 from piccolo.system.jobs.threads import Stopwatch, Workers
-from piccolo.together import group, mirrored
+from piccolo.together import group, members, mirrored
 from piccolo.together.bundle_search import Support
 from piccolo.together.expected import Expected
 from piccolo.together.group import localize_group, weigh_supports
@@ -30,6 +31,14 @@ from piccolo.together.members import Shot
 
 TIER = "scene"
 SUPPORT = Support(NO_CANDIDATE, None, is_found=True, odds=1.0, odds_elsewhere=0.0, num_places=100)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _searched_once():
+    """Bundles compare searches by several numbers of threads."""
+    with pytest.MonkeyPatch.context() as patch:
+        search_alone_once(patch, by_threads=False)
+        yield
 
 
 def _sphere(num, seed):
@@ -265,7 +274,8 @@ def _localized():
 
 def test_photos_that_are_not_sure_alone_are_together():
     photos, poses = zip(*taken_photos(), strict=True)
-    alone = rooms.locate(photos[1], rooms.scan_map(SEED), rooms.KNOWN)
+    shot = Shot(photos[1], rooms.KNOWN)
+    alone = members.find_alone(rooms.scan_map(SEED), shot, rooms.WORKERS, Stopwatch()).alone
     assert alone.status == "ambiguous"
     for number, (found, others) in enumerate(_localized()):
         assert found.status == "localized"

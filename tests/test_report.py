@@ -201,7 +201,7 @@ def test_results_of_another_scan_are_refused_or_told_of_on_the_page(house, tmp_p
     sources = [replace(scene.results[0].source, cloud_sha256=s) for s in (digest, "0" * 64, None)]
     results = [replace(r, source=s) for r, s in zip(scene.results, sources, strict=False)]
     lines = write_results(tmp_path / "poses.jsonl", results)
-    words = ["--results", str(lines), "--cloud", str(scene.cloud), "--cache", "none"]
+    words = ["--results", str(lines), "--cloud", str(scene.cloud)]
     for option, name in (("--out", "r"), ("--plan", "p.svg")):
         assert report.main([*words, option, str(tmp_path / name)]) == 3
         line = capsys.readouterr().err.splitlines()[-1]

@@ -184,7 +184,7 @@ def test_a_photo_is_found_by_shape(gravity, R):
 
 
 def test_intensity_is_a_channel_of_its_own():
-    cloud = rooms.room(PATTERNED, NUM_POINTS)[1]
+    cloud = rooms.room(PATTERNED, NUM_POINTS // 2)[1]
     gray = np.repeat(cloud.colors.mean(axis=1).astype(np.uint8)[:, None], 3, axis=1)
     found = {}
     for name, made in (("shape", _in_gray(cloud)), ("intensity", replace(_in_gray(cloud), colors=gray))):

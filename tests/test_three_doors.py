@@ -21,6 +21,7 @@ from piccolo.photo.camera import Mount
 from piccolo.photo.camera.model import pinhole
 from piccolo.poses.relative_poses import read_relative_poses
 from piccolo.system.jobs.threads import Workers
+from piccolo.together.coloring import painting
 from research.synthetic.world import render_picture
 
 TIER = "scene"
@@ -105,9 +106,11 @@ def test_photos_of_one_camera(photos, tmp_path):
         assert answer | {"pano": line["pano"], "beside": beside} == line
 
 
-def test_a_bundle_a_walk_and_a_colouring(tmp_path, coarse_colors):
-    cloud = rooms.write_cloud(tmp_path / "scan.ply", 1, 60_000)
-    queries = [rooms.query(1, index=k, width=512) for k in range(2)]
+def test_a_bundle_a_walk_and_a_colouring(tmp_path, coarse_colors, monkeypatch):
+    """One round of colours tells doors apart as well as two."""
+    monkeypatch.setattr(painting, "NUM_COLORING_ROUNDS", 1)
+    cloud = rooms.write_cloud(tmp_path / "scan.ply", 1, 20_000)
+    queries = [rooms.query(1, index=k, width=256) for k in range(2)]
     paths = [str(tmp_path / COLOR.format(k)) for k in range(2)]
     for path, query in zip(paths, queries, strict=True):
         write(Path(path), encoded(query.rgb, ".png"))
@@ -121,7 +124,7 @@ def test_a_bundle_a_walk_and_a_colouring(tmp_path, coarse_colors):
 
     poses = [query.pose for query in queries]
     taken = [result(path, pose) for path, pose in zip(paths, poses, strict=True)]
-    export(taken, "nerfstudio", tmp_path / "poses.json", Options(size=(512, 256)))
+    export(taken, "nerfstudio", tmp_path / "poses.json", Options(size=(256, 128)))
     by_file = run("bundle", "--relative", str(tmp_path / "poses.json"))
     relative = read_relative_poses(tmp_path / "poses.json", [Path(path) for path in paths])
     bundled = [_untimed(r.to_json()) for r in scan.localize_bundle(paths, relative, gravity="known")]

@@ -1,0 +1,39 @@
+"""Photos that several tests localize together are searched by themselves once for all tests of a module."""
+
+from piccolo.together import members, mirrored
+
+
+def _content(panorama):
+    assert (panorama.gpano, panorama.cameras) == (None, ()), "a plain picture"
+    return panorama.rgb.tobytes(), panorama.is_valid.tobytes()
+
+
+def _share(patch, owner, name, key):
+    """Let a function compute once for each key of its arguments."""
+    known = {}
+    compute = getattr(owner, name)
+
+    def ask(*given):
+        asked = key(*given)
+        if asked not in known:
+            known[asked] = compute(*given)
+        return known[asked]
+
+    patch.setattr(owner, name, ask)
+
+
+def search_alone_once(patch, by_threads):
+    """Share what photos find by themselves; for each number of threads if `by_threads`, else for all."""
+
+    def alone(scan_map, shot, workers, _):
+        threads = workers.num_threads if by_threads else None
+        return id(scan_map), _content(shot.panorama), shot.settings, threads
+
+    def mirror(member, result, means):
+        problem = member.found.problem
+        threads = means.workers.num_threads if by_threads else None
+        pose = result.best_pose and result.best_pose.key
+        return id(problem.scan_map), _content(problem.photo.panorama), pose, result.confidence, threads
+
+    _share(patch, members, "find_alone", alone)
+    _share(patch, mirrored, "compare_mirrored", mirror)
