@@ -9,6 +9,7 @@ photo hardly determines them, but their errors count: the covariance of the pose
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -35,7 +36,7 @@ from ..system.arrays import Array, Mask
 from ..system.jobs.threads import Workers
 from ..views.view import Cells
 from .comparison import mask_occluders
-from .covariance import UNCALIBRATED, compute_acting_range
+from .covariance import UNCALIBRATED, compute_acting_range, take
 from .lens_matches import MOST_LENS_CHANGE, MatchFit, add_matches, fit_matches
 from .scan_errors import displacement_variance
 from .self_calibration import (
@@ -58,6 +59,7 @@ OTHERS_WRONG = (0.05, 0.05, 0.05, 0.2)  # chosen: deviations of the other correc
 OTHERS_SHARES = (0.01, 0.01, 0.01, 0.01)  # chosen: shares of wrong claims
 FIRST_CHANGES = (-0.1, 0.1)  # of the focal length's logarithm: further starts of a first fit
 CHANGES_BESIDE = (-0.03, 0.03)  # of the logarithm at an end: starts of further descents, as the loss is rough
+ONE_OF = 4  # points counts where several starts are compared: the lowest end goes on with all
 NUM_FOCAL_VIEWS = 2  # times that a descent is repeated with the points seen from its end
 FAR_AWAY = 0.5  # [m] from the pose: a descent that ends farther away shows that the photo fixes no pose
 MOST_VARIANCE = 1.0  # of a focal length's logarithm: with more, the picture gives no estimate
@@ -273,29 +275,33 @@ def descend_lens(
         values[FOCAL] = change
         return descend_freely(cells, shown.photo.image("fine"), of_focal, pose, values, NEAR_LIMITS)
 
-    def find_lowest(freedom: Freedom, place: Pose, starts: Sequence[tuple[Pose, Array]]) -> FreeEnd:
-        points = mask_edge(shown.view_at(place, "points"), place, problem.photo.panorama.is_valid)
+    def find_points(place: Pose) -> Cells:
+        return mask_edge(shown.view_at(place, "points"), place, problem.photo.panorama.is_valid)
 
-        def go_on(start: tuple[Pose, Array]) -> FreeEnd:
-            return descend_freely(points, shown.photo.image("full"), freedom, *start, CLOSE)
+    def go_on(points: Cells, freedom: Freedom, start: tuple[Pose, Array]) -> FreeEnd:
+        return descend_freely(points, shown.photo.image("full"), freedom, *start, CLOSE)
 
-        return min(
-            workers.map(go_on, starts, "fit the focal length"),
-            key=lambda end: end.loss,
-        )
+    def find_lowest(freedom: Freedom, points: Cells, starts: Sequence[tuple[Pose, Array]]) -> FreeEnd:
+        some = take(points, np.arange(0, len(points.weights), ONE_OF))
+        ends = workers.map(partial(go_on, some, freedom), starts, "fit the focal length")
+        return min(ends, key=lambda end: end.loss)
 
     others = workers.map(begin, FIRST_CHANGES, "fit the focal length") if is_first else []
-    first = find_lowest(of_focal, pose, [(pose, np.zeros(len(LENS))), *(end.start for end in others)])
+    points = find_points(pose)
+    first = find_lowest(of_focal, points, [(pose, np.zeros(len(LENS))), *(end.start for end in others)])
     motion = estimate_corrections(first).motion[:, FOCAL]
     unit = np.eye(len(LENS))[FOCAL]
     beside = [(add(first.pose, motion * change), first.values + unit * change) for change in CHANGES_BESIDE]
-    near = find_lowest(of_focal, pose, [first.start, *beside])
+    near = find_lowest(of_focal, points, [first.start, *beside])
     for _ in range(NUM_FOCAL_VIEWS):
         if near.pose.distance(pose) > FAR_AWAY:
             break
-        near = find_lowest(of_focal, near.pose, [near.start])
+        points = find_points(near.pose)
+        near = go_on(points, of_focal, near.start)
+    points = find_points(near.pose)
     starts = [near.start, (by_matches.pose, by_matches.values)]
-    return near, find_lowest(of_all, near.pose, starts[: 1 + int(by_matches.values.any())])
+    lowest = find_lowest(of_all, points, starts[: 1 + int(by_matches.values.any())])
+    return near, go_on(points, of_all, lowest.start)
 
 
 def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
