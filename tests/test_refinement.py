@@ -262,7 +262,7 @@ def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
     assert rooms.errors(off, true_pose)[0] > 0.2
     cells = rooms.view(rooms.scan_map(1).octree, off.center_world, VIEWS["fine"], ALL)
     stage = AROUND_MIDDLE._replace(view="fine")
-    found, by_two = (ladder.descend_around(_problem(1), cells, off, stage, Workers(n)) for n in (1, 2))
+    found, by_two = (ladder.descend_around(_problem(1), cells, FINE_BLOCKS, off, stage, Workers(n)) for n in (1, 2))
     assert (found.pose.key, found.score) == (by_two.pose.key, by_two.score)
     assert rooms.errors(found.pose, true_pose)[0] < 0.06
     expected = ladder.score_on_cells(cells, FINE_BLOCKS, images.middle(), found.pose)
