@@ -300,11 +300,7 @@ def descend_lens(
     points = descents.find_points(pose)
     starts = [(pose, np.zeros(len(LENS))), *(end.start for end in others)]
     first = descents.find_lowest(points, of_focal, starts)
-    motion = estimate_corrections(first).motion[:, FOCAL]
-    beside = [
-        (add(first.pose, motion * change), first.values + is_focal * change) for change in CHANGES_BESIDE
-    ]
-    near = descents.find_lowest(points, of_focal, [first.start, *beside])
+    near = descents.find_lowest(points, of_focal, start_beside(first))
     for _ in range(NUM_FOCAL_VIEWS):
         if near.pose.distance(pose) > FAR_AWAY:
             break
@@ -313,6 +309,16 @@ def descend_lens(
     starts = [near.start, (by_matches.pose, by_matches.values)]
     lowest = descents.find_lowest(points, of_all, starts[: 1 + int(by_matches.values.any())])
     return near, descents.go_on(points, of_all, lowest.start)
+
+
+def start_beside(end: FreeEnd) -> list[tuple[Pose, Array]]:
+    """Return the end of a descent and starts beside it, with other focal lengths and the poses that fit."""
+    motion = estimate_corrections(end).motion[:, FOCAL]
+    unit = np.eye(len(LENS))[FOCAL]
+    return [
+        end.start,
+        *((add(end.pose, motion * change), end.values + unit * change) for change in CHANGES_BESIDE),
+    ]
 
 
 def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:

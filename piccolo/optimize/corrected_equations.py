@@ -52,16 +52,10 @@ def make_rows(n: int) -> Rows:
 
 
 @inline_kernel
-def write_rows(
-    points: Projected,
-    channels: Array32,
-    weights: Array32,
-    moves: Array32,
-    width: Scalar,
-    inverse_scale2: Scalar,
-    rows: Rows,
+def write_errors(
+    points: Projected, channels: Array32, weights: Array32, inverse_scale2: Scalar, rows: Rows
 ) -> tuple[Scalar, Scalar]:
-    """Write the rows of a chunk of points with channels (3, N), weights (N,), moves (p, 3, N).
+    """Write the products of gradients and errors of points with channels (3, N) and weights (N,).
 
     Return the sums of their losses and of their weights.
     """
@@ -87,9 +81,17 @@ def write_rows(
         rows.gvv[i] = w * (v0 * v0 + v1 * v1 + v2 * v2)
         rows.bu[i] = w * (u0 * e0 + u1 * e1 + u2 * e2)
         rows.bv[i] = w * (v0 * e0 + v1 * e1 + v2 * e2)
+    return total, loaded
+
+
+@inline_kernel
+def write_derivatives(points: Projected, moves: Array32, width: Scalar, rows: Rows) -> None:
+    """Write the derivatives of the pixels of points with moves (p, 3, N), in an image of `width`."""
+    p = points
     u = rows.of_u
     v = rows.of_v
-    for i in range(len(weights)):
+    count = moves.shape[2]
+    for i in range(count):
         x = p.x[i]
         y = p.y[i]
         z = p.z[i]
@@ -110,10 +112,9 @@ def write_rows(
         of_u = u[NUM_OF_POSE + j]
         of_v = v[NUM_OF_POSE + j]
         mx, my, mz = moves[j, 0], moves[j, 1], moves[j, 2]
-        for i in range(len(weights)):
+        for i in range(count):
             of_u[i] = -u[3, i] * mx[i] - u[4, i] * my[i]
             of_v[i] = -v[3, i] * mx[i] - v[4, i] * my[i] - v[5, i] * mz[i]
-    return total, loaded
 
 
 @inline_kernel
@@ -167,15 +168,9 @@ def write_free_equations(
         for lo in range(begins[k], begins[k + 1], TEXEL_CHUNK):
             hi = min(lo + TEXEL_CHUNK, begins[k + 1])
             project(points[0][lo:hi], points[1][lo:hi], points[2][lo:hi], identity, origin, texels, width, p)
-            total, loaded = write_rows(
-                p,
-                channels[:, lo:hi],
-                weights[lo:hi],
-                moves[:, :, lo:hi],
-                np.float32(width),
-                inverse_scale2,
-                rows,
-            )
+            part = slice(lo, hi)
+            total, loaded = write_errors(p, channels[:, part], weights[part], inverse_scale2, rows)
+            write_derivatives(p, moves[:, :, part], np.float32(width), rows)
             loss[k] += total
             weight[k] += loaded
             add_rows(rows, hi - lo, gradients[k], matrices[k])
