@@ -6,7 +6,7 @@ import naive
 import numpy as np
 import pytest
 
-from piccolo.geometry.cone import Cone
+from piccolo.geometry.cone import EVERYWHERE, Cone, cone_about
 from piccolo.geometry.pose import exp_so3, rotate_points, yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.photo.panorama.texels import find_valid, pack_texels
@@ -119,3 +119,15 @@ def test_of_a_photo_that_shows_nothing_no_cell_is_kept():
     cone = find_cone(_image(np.zeros((WIDTH // 2, WIDTH), bool)))
     assert isinstance(cone, Cone)
     assert len(_select(_cells(np.random.default_rng(1)), cone, TILTED, np.zeros(3))) == 0
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_cone_contains_the_rays_within_its_angle(dtype):
+    axis = np.array([0.6, -0.48, 0.64])
+    across = np.cross(axis, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across)
+    angles = np.radians([0.0, 29.9, 30.1, 90.0, 180.0])
+    rays = (np.outer(np.cos(angles), axis) + np.outer(np.sin(angles), across)).astype(dtype)
+    cone = cone_about(axis, math.cos(math.radians(30.0)))
+    assert cone.contains(rays).tolist() == [True, True, False, False, False]
+    assert EVERYWHERE.contains(rays).all()

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from piccolo.judge.candidate import Selection
 from piccolo.judge.claim import PictureCorrections
 from piccolo.judge.result_parts import Alternative, Evidence, FocalLength
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import run as module
+from piccolo.localization import claimed_geometry, run as module
 from piccolo.localization.claimed_geometry import follow_matches, recalibrate
 from piccolo.localization.run import select_likeliest
 from piccolo.photo.camera import Calibration, Camera, Mount
@@ -31,9 +32,11 @@ from piccolo.photo.panorama import read_panorama
 from piccolo.photo.photo import Photo
 from piccolo.problem.method import METHOD
 from piccolo.system.jobs.threads import Workers
+from piccolo.views.view import Cells
 from research.synthetic.world import render_picture
 
 TIER = "scene"
+ELSEWHERE = Pose(yaw_rotation(0.4), np.array([1.0, 2.0, 0.5]))
 
 
 def _photo(camera, yaw=0.0):
@@ -184,6 +187,56 @@ def test_matches_lead_to_a_focal_length_that_is_far_off():
     by_matches = fit_matches(METHOD, problem.given.cameras[0], found.best.pose, matches, focal.FOCAL_WIDTHS)
     assert abs(by_matches.values[0]) < 2.5 / math.sqrt(by_matches.information)
     assert follow_matches(problem, found, rooms.WORKERS) == (problem, found)
+
+
+def test_starts_are_compared_on_a_fourth_of_the_points(monkeypatch):
+    """The lowest end is the best start; only the descents after the comparison have all points."""
+    asked = []
+
+    def descend(cells, image, freedom, pose, values, limits):
+        asked.append(len(cells.weights))
+        return SimpleNamespace(loss=abs(values[0] - 0.28), start=(pose, values))
+
+    monkeypatch.setattr(focal, "descend_freely", descend)
+    shown = SimpleNamespace(photo=SimpleNamespace(image=lambda name: name))
+    points = Cells(np.ones((3, 402)), np.ones((3, 402)), np.ones(402), np.zeros(3))
+    descents = focal.LensDescents(shown, np.ones((4, 8), bool), Workers(1))
+    starts = [(ELSEWHERE, np.full(5, value)) for value in (0.0, 0.1, 0.3, 0.5)]
+    lowest = descents.find_lowest(points, None, starts)
+    assert lowest.start[1] is starts[2][1]
+    descents.go_on(points, None, lowest.start)
+    assert asked == [101] * 4 + [402]
+
+
+@pytest.mark.parametrize(
+    ("changes", "num_refined"),
+    [
+        ([0.0], 0),
+        ([0.02, 0.0], 1),
+        ([0.02, 0.01, 0.001, 0.0], 3),
+        ([0.02, -0.03], 1),  # it does not settle
+        ([0.05, 0.04, 0.03, 0.02, 0.01], 4),  # at most
+    ],
+)
+def test_a_lens_is_fitted_again_for_as_long_as_it_settles(monkeypatch, changes, num_refined):
+    refined = []
+    fits = iter(changes)
+    covariance = np.array([[1e-8]])
+
+    def fit(*_, is_first=True):
+        return focal.FocalFit(np.array([next(fits)]), covariance, np.zeros((6, 1)), None, 0.0)
+
+    def refine(problem, found, *_):
+        refined.append(found)
+        return problem, found
+
+    monkeypatch.setattr(claimed_geometry, "fit_focal", fit)
+    monkeypatch.setattr(claimed_geometry, "refine_with", refine)
+    monkeypatch.setattr(claimed_geometry, "follow_matches", lambda problem, found, _: (problem, found))
+    monkeypatch.setattr(claimed_geometry, "find_change_left", lambda given, fit: 0.0 * fit.change)
+    found = SimpleNamespace(best=SimpleNamespace(pose=ELSEWHERE))
+    claimed_geometry.calibrate(SimpleNamespace(given=None), found, rooms.WORKERS)
+    assert len(refined) == num_refined
 
 
 def test_other_poses_with_other_guesses_share_the_probability():

@@ -219,6 +219,24 @@ def test_cells_and_points_are_those_that_the_photo_shows():
     assert asked.view_at(pose, "points") == (shown.tobytes(), cone, 30_000)
 
 
+@pytest.mark.parametrize("view", ["middle", "fine"])
+def test_cells_of_no_weight_are_left_out_of_a_part_of_the_sphere_and_change_no_score(view):
+    whole = _problem(1)
+    pose = rooms.scene(1)[2]
+    is_hidden = ~(np.abs(np.arange(64) - 20) < 8) & np.ones((32, 1), bool)
+    narrow = whole.show(whole.photo.mask(is_hidden))
+    cells, blocks = ladder.see_cells(narrow, pose, view)
+    of_all, all_blocks = narrow.view_at(pose, view), VIEWS[view].arrays.blocks
+    assert (cells.weights > 0.0).all()
+    assert len(cells.weights) == len(blocks) == np.count_nonzero(of_all.weights) < 0.4 * len(all_blocks)
+    image = narrow.photo.image(view)
+    some, every = (
+        ladder.score_on_cells(*seen, image, pose).score for seen in ((cells, blocks), (of_all, all_blocks))
+    )
+    assert some == pytest.approx(every, rel=1e-6)
+    assert len(ladder.see_cells(whole, pose, view)[1]) == len(all_blocks)
+
+
 @pytest.mark.parametrize(("seed", "most"), [(1, 5e-5), (3, 5e-4), (4, 5e-5)])
 def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
     """Starts 5 mm apart end within 0.05 mm where the loss has one minimum; in noise it has several."""
@@ -262,7 +280,8 @@ def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
     assert rooms.errors(off, true_pose)[0] > 0.2
     cells = rooms.view(rooms.scan_map(1).octree, off.center_world, VIEWS["fine"], ALL)
     stage = AROUND_MIDDLE._replace(view="fine")
-    found, by_two = (ladder.descend_around(_problem(1), cells, off, stage, Workers(n)) for n in (1, 2))
+    seen = cells, FINE_BLOCKS
+    found, by_two = (ladder.descend_around(_problem(1), *seen, off, stage, Workers(n)) for n in (1, 2))
     assert (found.pose.key, found.score) == (by_two.pose.key, by_two.score)
     assert rooms.errors(found.pose, true_pose)[0] < 0.06
     expected = ladder.score_on_cells(cells, FINE_BLOCKS, images.middle(), found.pose)

@@ -9,6 +9,7 @@ photo hardly determines them, but their errors count: the covariance of the pose
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -35,7 +36,7 @@ from ..system.arrays import Array, Mask
 from ..system.jobs.threads import Workers
 from ..views.view import Cells
 from .comparison import mask_occluders
-from .covariance import UNCALIBRATED, compute_acting_range
+from .covariance import UNCALIBRATED, compute_acting_range, take
 from .lens_matches import MOST_LENS_CHANGE, MatchFit, add_matches, fit_matches
 from .scan_errors import displacement_variance
 from .self_calibration import (
@@ -58,6 +59,7 @@ OTHERS_WRONG = (0.05, 0.05, 0.05, 0.2)  # chosen: deviations of the other correc
 OTHERS_SHARES = (0.01, 0.01, 0.01, 0.01)  # chosen: shares of wrong claims
 FIRST_CHANGES = (-0.1, 0.1)  # of the focal length's logarithm: further starts of a first fit
 CHANGES_BESIDE = (-0.03, 0.03)  # of the logarithm at an end: starts of further descents, as the loss is rough
+ONE_OF = 4  # points counts where descents from several starts are compared
 NUM_FOCAL_VIEWS = 2  # times that a descent is repeated with the points seen from its end
 FAR_AWAY = 0.5  # [m] from the pose: a descent that ends farther away shows that the photo fixes no pose
 MOST_VARIANCE = 1.0  # of a focal length's logarithm: with more, the picture gives no estimate
@@ -243,6 +245,33 @@ def make_claim(prior: FocalPrior, camera: Camera) -> Claim:
     return Claim(expected, deviations, np.array([WRONG_DEVIATION, *OTHERS_WRONG]), shares)
 
 
+class LensDescents(NamedTuple):
+    """Descents of a photo's lens and pose, on the scan that is seen from some place."""
+
+    shown: Problem  # with the photo without what hides the scan
+    is_valid: Mask  # (H, W) pixels that the photo has
+    workers: Workers
+
+    def find_points(self, place: Pose) -> Cells:
+        """Return the points seen from a place."""
+        return mask_edge(self.shown.view_at(place, "points"), place, self.is_valid)
+
+    def begin(self, cells: Cells, freedom: Freedom, pose: Pose, change: float) -> FreeEnd:
+        """Descend on cells seen from a pose, from a focal length whose logarithm differs by `change`."""
+        values = np.where(np.arange(len(LENS)) == FOCAL, change, 0.0)
+        return descend_freely(cells, self.shown.photo.image("fine"), freedom, pose, values, NEAR_LIMITS)
+
+    def go_on(self, points: Cells, freedom: Freedom, start: tuple[Pose, Array]) -> FreeEnd:
+        """Descend on points from a pose and corrections."""
+        return descend_freely(points, self.shown.photo.image("full"), freedom, *start, CLOSE)
+
+    def find_lowest(self, points: Cells, freedom: Freedom, starts: Sequence[tuple[Pose, Array]]) -> FreeEnd:
+        """Return the lowest end of descents from several starts, on a fraction of the points."""
+        some = take(points, np.arange(0, len(points.weights), ONE_OF))
+        ends = self.workers.map(partial(self.go_on, some, freedom), starts, "fit the focal length")
+        return min(ends, key=lambda end: end.loss)
+
+
 def descend_lens(
     problem: Problem,
     best: Candidate,
@@ -254,48 +283,42 @@ def descend_lens(
     """Descend with the focal length free, then with all corrections of the lens; return both lowest ends.
 
     The descents of the focal length begin with that of the last fit and, in a first fit, with others too. The
-    descents of all corrections begin at the end of the former, and at the fit to the matches. The focal
-    length descends again with the points that are seen from its end: points that are seen from another pose
-    favour that pose.
+    descents of all corrections begin at the end of the former, and at the fit to the matches. Of several
+    starts only the one with the lowest end goes on with all points. The focal length descends again with the
+    points that are seen from its end: points that are seen from another pose favour that pose.
     """
     pose = best.pose
     shown = problem.show(mask_occluders(problem, best.comparison, best.unoccluded).photo)
+    descents = LensDescents(shown, problem.photo.panorama.is_valid, workers)
     corrections = Corrections(problem.given.cameras[0])
     wide = np.maximum(claim.wrong_deviations, claim.deviations)
-    of_focal = Freedom(
-        corrections, np.where(np.arange(len(wide)) == FOCAL, wide, claim.deviations), MOST_LENS_CHANGE
-    )
+    is_focal = np.arange(len(LENS)) == FOCAL
+    of_focal = Freedom(corrections, np.where(is_focal, wide, claim.deviations), MOST_LENS_CHANGE)
     of_all = Freedom(corrections, wide, MOST_LENS_CHANGE)
-    cells = shown.view_at(pose, "fine")
-
-    def begin(change: float) -> FreeEnd:
-        values = np.zeros(len(LENS))
-        values[FOCAL] = change
-        return descend_freely(cells, shown.photo.image("fine"), of_focal, pose, values, NEAR_LIMITS)
-
-    def find_lowest(freedom: Freedom, place: Pose, starts: Sequence[tuple[Pose, Array]]) -> FreeEnd:
-        points = mask_edge(shown.view_at(place, "points"), place, problem.photo.panorama.is_valid)
-
-        def go_on(start: tuple[Pose, Array]) -> FreeEnd:
-            return descend_freely(points, shown.photo.image("full"), freedom, *start, CLOSE)
-
-        return min(
-            workers.map(go_on, starts, "fit the focal length"),
-            key=lambda end: end.loss,
-        )
-
+    begin = partial(descents.begin, shown.view_at(pose, "fine"), of_focal, pose)
     others = workers.map(begin, FIRST_CHANGES, "fit the focal length") if is_first else []
-    first = find_lowest(of_focal, pose, [(pose, np.zeros(len(LENS))), *(end.start for end in others)])
-    motion = estimate_corrections(first).motion[:, FOCAL]
-    unit = np.eye(len(LENS))[FOCAL]
-    beside = [(add(first.pose, motion * change), first.values + unit * change) for change in CHANGES_BESIDE]
-    near = find_lowest(of_focal, pose, [first.start, *beside])
+    points = descents.find_points(pose)
+    starts = [(pose, np.zeros(len(LENS))), *(end.start for end in others)]
+    first = descents.find_lowest(points, of_focal, starts)
+    near = descents.find_lowest(points, of_focal, start_beside(first))
     for _ in range(NUM_FOCAL_VIEWS):
         if near.pose.distance(pose) > FAR_AWAY:
             break
-        near = find_lowest(of_focal, near.pose, [near.start])
+        near = descents.go_on(descents.find_points(near.pose), of_focal, near.start)
+    points = descents.find_points(near.pose)
     starts = [near.start, (by_matches.pose, by_matches.values)]
-    return near, find_lowest(of_all, near.pose, starts[: 1 + int(by_matches.values.any())])
+    lowest = descents.find_lowest(points, of_all, starts[: 1 + int(by_matches.values.any())])
+    return near, descents.go_on(points, of_all, lowest.start)
+
+
+def start_beside(end: FreeEnd) -> list[tuple[Pose, Array]]:
+    """Return the end of a descent and starts beside it, with other focal lengths and the poses that fit."""
+    motion = estimate_corrections(end).motion[:, FOCAL]
+    unit = np.eye(len(LENS))[FOCAL]
+    return [
+        end.start,
+        *((add(end.pose, motion * change), end.values + unit * change) for change in CHANGES_BESIDE),
+    ]
 
 
 def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:

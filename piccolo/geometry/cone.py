@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..system.arrays import Array, Floats
+from ..system.arrays import Array, Floats, Mask
 from ..system.kernels.jit import F0, Scalar, inline_kernel
 
 
@@ -21,6 +21,10 @@ class Cone(NamedTuple):
     def axis(self) -> Array:
         """Return the axis (3,)."""
         return np.array(self[:3])
+
+    def contains(self, rays: Floats) -> Mask:
+        """Return True for each of the unit directions (N, 3) that lies in the cone."""
+        return np.asarray(rays @ self.axis.astype(rays.dtype) >= self.cos_angle)
 
     def turn(self, R_target_from_source: Floats) -> "Cone":
         """Return the cone in another frame, given the rotation (3, 3)."""

@@ -47,14 +47,17 @@ HERE_LIMITS = Limits(0.7, 1, 1e-4)  # on points, where the claim holds: the end 
 def calibrate(problem: Problem, found: Selection, workers: Workers) -> tuple[Problem, Selection, FocalFit]:
     """Fit the focal length at the best pose, and refine the poses with it, until it hardly changes.
 
-    The last change is applied too, so that the focal length found lies between the given one and that of the
-    picture.
+    At wrong poses it may change no less from fit to fit; then it is not fitted again. The last change is
+    applied too, so that the focal length found lies between the given one and that of the picture.
     """
     problem, found = follow_matches(problem, found, workers)
     fit = fit_focal(problem, found.best, workers)
+    before = math.inf
     for _ in range(MAX_CALIBRATIONS):
-        if fit.is_at_rest:
+        change = float(np.abs(fit.change).max())
+        if fit.is_at_rest or change >= before:
             break
+        before = change
         problem, found = refine_with(problem, found, fit.change, fit.move(found.best.pose), workers)
         fit = fit_focal(problem, found.best, workers, is_first=False)
     left = find_change_left(problem.given, fit)

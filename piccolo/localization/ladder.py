@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 
 from ..evidence.comparison import mask_occluders
+from ..evidence.covariance import take
 from ..evidence.examine import examine
 from ..geometry.levenberg_marquardt import retract
 from ..geometry.pose import Pose, orthonormal
@@ -19,7 +20,7 @@ from ..photo.panorama.texels import Texels
 from ..problem.method import Method
 from ..problem.problem import Problem
 from ..problem.profile import VIEWS
-from ..problem.stages import AROUND_FINE, AROUND_MIDDLE, FINE, FULL, LAST, MIDDLE, Limits, Stage
+from ..problem.stages import AROUND_FINE, AROUND_MIDDLE, FINE, FULL, LAST, MIDDLE, Limits, Stage, ViewName
 from ..system.arrays import Array, Array32, Int32s
 from ..system.jobs.threads import Workers
 from ..system.kernels.jit import kernel
@@ -36,32 +37,42 @@ def refine(problem: Problem, start: Pose, workers: Workers, stage: Stage) -> Hyp
 
     The end is scored on the cells of the view; on points its score is nan.
     """
-    cells = problem.view_at(start, stage.view)
+    cells, blocks = see_cells(problem, start, stage.view)
     if stage.around is None:
-        return descend_on(problem, cells, start, stage)
-    return descend_around(problem, cells, start, stage, workers)
+        return descend_on(problem, cells, blocks, start, stage)
+    return descend_around(problem, cells, blocks, start, stage, workers)
 
 
-def descend_on(problem: Problem, cells: Cells, pose: Pose, stage: Stage) -> Hypothesis:
+def see_cells(problem: Problem, pose: Pose, view: ViewName) -> tuple[Cells, Int32s]:
+    """Return the cells or points of a view that are seen from a pose, and the block of each cell.
+
+    Most cells weigh nothing if the photo shows a part of the sphere; then these are left out.
+    """
+    cells = problem.view_at(pose, view)
+    blocks = VIEWS[view].arrays.blocks
+    if view == "points" or not problem.photo.is_partial:
+        return cells, blocks
+    counts = np.flatnonzero(cells.weights)
+    return take(cells, counts), blocks[counts]
+
+
+def descend_on(problem: Problem, cells: Cells, blocks: Int32s, pose: Pose, stage: Stage) -> Hypothesis:
     """Descend from a pose on the cells or points that are seen from there, and score the end on the cells."""
     image = problem.photo.image(stage.image)
     end = descend(cells, image, pose, stage.limits)
-    if stage.view == "points":
-        return Hypothesis(end, math.nan)
-    return score_on_cells(cells, VIEWS[stage.view].arrays.blocks, image, end)
+    return Hypothesis(end, math.nan) if stage.view == "points" else score_on_cells(cells, blocks, image, end)
 
 
 def climb(problem: Problem, start: Pose, workers: Workers) -> Hypothesis:
     """Refine a pose on fine cells, and poses around it, for as long as its score rises."""
-    first = problem.view_at(start, FINE.view)
-    blocks = VIEWS[FINE.view].arrays.blocks
+    first = see_cells(problem, start, FINE.view)
 
     def perturb(best: Hypothesis) -> Hypothesis:
-        cells = first if best.pose is start else problem.view_at(best.pose, FINE.view)
-        around = descend_around(problem, cells, best.pose, AROUND_FINE, workers)
+        seen = first if best.pose is start else see_cells(problem, best.pose, FINE.view)
+        around = descend_around(problem, *seen, best.pose, AROUND_FINE, workers)
         return refine(problem, around.pose, workers, FINE)
 
-    begin = score_on_cells(first, blocks, problem.photo.image(FINE.image), start)
+    begin = score_on_cells(*first, problem.photo.image(FINE.image), start)
     return replace(climb_by(perturb, begin, problem.method), is_climbed=True)
 
 
@@ -158,7 +169,7 @@ def converge(problem: Problem, found: Candidate, stage: Stage, workers: Workers)
     for k in range(stage.rounds.most):
         center = pose.center_world
         for each in (*problem.profile.soft, stage) if k == 0 else (stage,):
-            pose = descend_on(masked, masked.view_at(pose, each.view), pose, each).pose
+            pose = descend_on(masked, *see_cells(masked, pose, each.view), pose, each).pose
         if math.dist(pose.center_world, center) < stage.rounds.arrived:
             break
     end = examine(problem, pose, found)
@@ -230,10 +241,11 @@ def score_on_cells(cells: Cells, blocks: Int32s, image: Texels, pose: Pose) -> H
     return Hypothesis(pose, float(value))
 
 
-def descend_around(problem: Problem, cells: Cells, pose: Pose, stage: Stage, workers: Workers) -> Hypothesis:
+def descend_around(
+    problem: Problem, cells: Cells, blocks: Int32s, pose: Pose, stage: Stage, workers: Workers
+) -> Hypothesis:
     """Return the best end of descents from a pose and around it, on the coarse image first."""
     assert stage.around is not None
-    blocks = VIEWS[stage.view].arrays.blocks
     coarse = problem.photo.image(stage.around.image)
     fine = problem.photo.image(stage.image)
     limits = stage.limits

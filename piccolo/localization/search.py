@@ -1,6 +1,7 @@
 """Score every candidate position with every rotation, and keep the distinct best."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -212,6 +213,16 @@ def thin_starts(method: Method, num_candidates: int, most: int) -> int:
     return min(max(num_candidates // method.candidates_per_start, MIN_STARTS), most)
 
 
+@cache
+def level_rotations() -> Array:
+    """Return the rotations (N, 3, 3), camera from level, of cameras that are held about level."""
+    headings = 360.0 / NUM_LEVEL_YAWS * np.arange(NUM_LEVEL_YAWS)
+    tilted = [R_cam_from_angles(heading, pitch, 0.0) for pitch in PITCHES_DEG for heading in headings]
+    rotations = np.stack(tilted)
+    rotations.flags.writeable = False  # it is kept for the next photo
+    return rotations
+
+
 def list_rotations(problem: Problem, tilts: Tilts, effort: Effort) -> Array:
     """Return the rotations (N, 3, 3), camera from map, to search: upright, about level, or all."""
     R_map_from_world = problem.scan_map.R_map_from_world
@@ -220,9 +231,7 @@ def list_rotations(problem: Problem, tilts: Tilts, effort: Effort) -> Array:
     elif tilts == "known":
         rotations = problem.photo.R_cam_from_level @ uniform_yaws(effort.num_yaws)
     elif tilts == "level":
-        headings = 360.0 / NUM_LEVEL_YAWS * np.arange(NUM_LEVEL_YAWS)
-        tilted = [R_cam_from_angles(heading, pitch, 0.0) for pitch in PITCHES_DEG for heading in headings]
-        rotations = problem.photo.R_cam_from_level @ np.stack(tilted)
+        rotations = problem.photo.R_cam_from_level @ level_rotations()
     else:
         rotations = uniform_rotations(effort.num_rotations)
     return allow_rotations(rotations @ R_map_from_world, problem.prior) @ R_map_from_world.T

@@ -11,9 +11,9 @@ import numpy as np
 
 from ..geometry.robust import inline_geman_mcclure
 from ..geometry.sphere import pixel_jacobian
-from ..photo.panorama.texels import TEXEL_CHUNK, blend_with_gradient, is_valid, make_chunk, project
+from ..photo.panorama.texels import TEXEL_CHUNK, Projected, blend_with_gradient, is_valid, make_chunk, project
 from ..system.arrays import Array, Array32, Int64s
-from ..system.kernels.jit import F0, kernel
+from ..system.kernels.jit import F0, Scalar, inline_kernel, kernel
 from .channel_loss import ChannelProblem
 
 NUM_OF_POSE = 6  # numbers of a pose's step
@@ -26,6 +26,117 @@ class FreeSums(NamedTuple):
     weight: Array  # (parts,) sum of the weights of the points on valid pixels
     gradients: Array  # (parts, n)
     matrices: Array  # (parts, n, n)
+
+
+class Rows(NamedTuple):
+    """Of a chunk of points, what the equations are made of; arrays (..., TEXEL_CHUNK)."""
+
+    of_u: Array32  # (n, TEXEL_CHUNK) derivatives of the pixel by the unknowns
+    of_v: Array32
+    along_u: Array32  # (TEXEL_CHUNK,) one unknown's derivatives, weighted by the image gradients
+    along_v: Array32
+    guu: Array32  # weighted sums over channels of the products of the image gradients
+    guv: Array32
+    gvv: Array32
+    bu: Array32  # and of the gradients with the errors
+    bv: Array32
+
+
+@inline_kernel
+def make_rows(n: int) -> Rows:
+    """Make the arrays of a chunk for n unknowns, not filled."""
+    f = np.empty((7, TEXEL_CHUNK), np.float32)
+    of_u = np.empty((n, TEXEL_CHUNK), np.float32)
+    of_v = np.empty((n, TEXEL_CHUNK), np.float32)
+    return Rows(of_u, of_v, f[0], f[1], f[2], f[3], f[4], f[5], f[6])
+
+
+@inline_kernel
+def write_errors(
+    points: Projected, channels: Array32, weights: Array32, inverse_scale2: Scalar, rows: Rows
+) -> tuple[Scalar, Scalar]:
+    """Write the products of gradients and errors of points with channels (3, N) and weights (N,).
+
+    Return the sums of their losses and of their weights.
+    """
+    p = points
+    total = F0
+    loaded = F0
+    c0, c1, c2 = channels[0], channels[1], channels[2]
+    for i in range(len(weights)):
+        t00, t10, t01, t11 = p.t00[i], p.t10[i], p.t01[i], p.t11[i]
+        weight = weights[i] * is_valid(t00, t10, t01, t11)
+        e0, u0, v0 = blend_with_gradient(t00, t10, t01, t11, p.fu[i], p.fv[i], 0)
+        e1, u1, v1 = blend_with_gradient(t00, t10, t01, t11, p.fu[i], p.fv[i], 8)
+        e2, u2, v2 = blend_with_gradient(t00, t10, t01, t11, p.fu[i], p.fv[i], 16)
+        e0 -= c0[i]
+        e1 -= c1[i]
+        e2 -= c2[i]
+        cost, w = inline_geman_mcclure(e0 * e0 + e1 * e1 + e2 * e2, inverse_scale2)
+        total += weight * cost
+        loaded += weight
+        w *= weight
+        rows.guu[i] = w * (u0 * u0 + u1 * u1 + u2 * u2)
+        rows.guv[i] = w * (u0 * v0 + u1 * v1 + u2 * v2)
+        rows.gvv[i] = w * (v0 * v0 + v1 * v1 + v2 * v2)
+        rows.bu[i] = w * (u0 * e0 + u1 * e1 + u2 * e2)
+        rows.bv[i] = w * (v0 * e0 + v1 * e1 + v2 * e2)
+    return total, loaded
+
+
+@inline_kernel
+def write_derivatives(points: Projected, moves: Array32, width: Scalar, rows: Rows) -> None:
+    """Write the derivatives of the pixels of points with moves (p, 3, N), in an image of `width`."""
+    p = points
+    u = rows.of_u
+    v = rows.of_v
+    count = moves.shape[2]
+    for i in range(count):
+        x = p.x[i]
+        y = p.y[i]
+        z = p.z[i]
+        ux, uy, vx, vy, vz = pixel_jacobian(x, y, z, x * x + y * y, width)
+        u[0, i] = -z * uy
+        u[1, i] = z * ux
+        u[2, i] = x * uy - y * ux
+        u[3, i] = -ux
+        u[4, i] = -uy
+        u[5, i] = F0
+        v[0, i] = y * vz - z * vy
+        v[1, i] = z * vx - x * vz
+        v[2, i] = x * vy - y * vx
+        v[3, i] = -vx
+        v[4, i] = -vy
+        v[5, i] = -vz
+    for j in range(len(moves)):
+        of_u = u[NUM_OF_POSE + j]
+        of_v = v[NUM_OF_POSE + j]
+        mx, my, mz = moves[j, 0], moves[j, 1], moves[j, 2]
+        for i in range(count):
+            of_u[i] = -u[3, i] * mx[i] - u[4, i] * my[i]
+            of_v[i] = -v[3, i] * mx[i] - v[4, i] * my[i] - v[5, i] * mz[i]
+
+
+@inline_kernel
+def add_rows(rows: Rows, count: int, gradient: Array, matrix: Array) -> None:
+    """Add the rows of `count` points to a gradient (n,) and to the upper triangle of a matrix (n, n)."""
+    n = len(gradient)
+    for a in range(n):
+        u = rows.of_u[a]
+        v = rows.of_v[a]
+        slope = F0
+        for i in range(count):
+            slope += u[i] * rows.bu[i] + v[i] * rows.bv[i]
+            rows.along_u[i] = rows.guu[i] * u[i] + rows.guv[i] * v[i]
+            rows.along_v[i] = rows.guv[i] * u[i] + rows.gvv[i] * v[i]
+        gradient[a] += slope
+        for b in range(a, n):
+            other_u = rows.of_u[b]
+            other_v = rows.of_v[b]
+            product = F0
+            for i in range(count):
+                product += rows.along_u[i] * other_u[i] + rows.along_v[i] * other_v[i]
+            matrix[a, b] += product
 
 
 @kernel
@@ -41,75 +152,28 @@ def write_free_equations(
     """Write the sums of `FreeSums` for points in the camera's axes, and their moves (p, 3, N) by corrections.
 
     Of each matrix the upper triangle is written. Part k is the points from begins[k] to begins[k + 1]. Points
-    on masked pixels add nothing.
+    on masked pixels add nothing. Sums of a chunk are float32.
     """
     points, channels, weights, texels, width, scale = problem
-    n = NUM_OF_POSE + len(moves)
     inverse_scale2 = np.float32(1.0 / (scale * scale))
     identity = np.eye(3)
     origin = np.zeros(3)
-    of_u = np.empty(n, np.float32)
-    of_v = np.empty(n, np.float32)
     p = make_chunk()
+    rows = make_rows(NUM_OF_POSE + len(moves))
     loss[:] = 0.0
     weight[:] = 0.0
     gradients[:] = 0.0
     matrices[:] = 0.0
     for k in range(len(begins) - 1):
-        g = gradients[k]
-        A = matrices[k]
         for lo in range(begins[k], begins[k + 1], TEXEL_CHUNK):
             hi = min(lo + TEXEL_CHUNK, begins[k + 1])
-            X, Y, Z = points[0][lo:hi], points[1][lo:hi], points[2][lo:hi]
-            project(X, Y, Z, identity, origin, texels, width, p)
-            for i in range(hi - lo):
-                t00, t10, t01, t11 = p.t00[i], p.t10[i], p.t01[i], p.t11[i]
-                loaded = weights[lo + i] * is_valid(t00, t10, t01, t11)
-                if loaded <= F0:
-                    continue
-                x = p.x[i]
-                y = p.y[i]
-                z = p.z[i]
-                e0, u0, v0 = blend_with_gradient(t00, t10, t01, t11, p.fu[i], p.fv[i], 0)
-                e1, u1, v1 = blend_with_gradient(t00, t10, t01, t11, p.fu[i], p.fv[i], 8)
-                e2, u2, v2 = blend_with_gradient(t00, t10, t01, t11, p.fu[i], p.fv[i], 16)
-                e0 -= channels[0][lo + i]
-                e1 -= channels[1][lo + i]
-                e2 -= channels[2][lo + i]
-                cost, w = inline_geman_mcclure(e0 * e0 + e1 * e1 + e2 * e2, inverse_scale2)
-                loss[k] += loaded * cost
-                weight[k] += loaded
-                w *= loaded
-                guu = w * (u0 * u0 + u1 * u1 + u2 * u2)
-                guv = w * (u0 * v0 + u1 * v1 + u2 * v2)
-                gvv = w * (v0 * v0 + v1 * v1 + v2 * v2)
-                bu = w * (u0 * e0 + u1 * e1 + u2 * e2)
-                bv = w * (v0 * e0 + v1 * e1 + v2 * e2)
-                ux, uy, vx, vy, vz = pixel_jacobian(x, y, z, x * x + y * y, np.float32(width))
-                of_u[0] = -z * uy
-                of_u[1] = z * ux
-                of_u[2] = x * uy - y * ux
-                of_u[3] = -ux
-                of_u[4] = -uy
-                of_u[5] = F0
-                of_v[0] = y * vz - z * vy
-                of_v[1] = z * vx - x * vz
-                of_v[2] = x * vy - y * vx
-                of_v[3] = -vx
-                of_v[4] = -vy
-                of_v[5] = -vz
-                for j in range(len(moves)):
-                    mx = moves[j, 0, lo + i]
-                    my = moves[j, 1, lo + i]
-                    mz = moves[j, 2, lo + i]
-                    of_u[NUM_OF_POSE + j] = ux * mx + uy * my
-                    of_v[NUM_OF_POSE + j] = vx * mx + vy * my + vz * mz
-                for a in range(n):
-                    g[a] += of_u[a] * bu + of_v[a] * bv
-                    along_u = guu * of_u[a] + guv * of_v[a]
-                    along_v = guv * of_u[a] + gvv * of_v[a]
-                    for b in range(a, n):
-                        A[a, b] += along_u * of_u[b] + along_v * of_v[b]
+            project(points[0][lo:hi], points[1][lo:hi], points[2][lo:hi], identity, origin, texels, width, p)
+            part = slice(lo, hi)
+            total, loaded = write_errors(p, channels[:, part], weights[part], inverse_scale2, rows)
+            write_derivatives(p, moves[:, :, part], np.float32(width), rows)
+            loss[k] += total
+            weight[k] += loaded
+            add_rows(rows, hi - lo, gradients[k], matrices[k])
 
 
 def sum_free_equations(problem: ChannelProblem, moves: Array32, begins: Int64s) -> FreeSums:

@@ -79,8 +79,11 @@ class PhotoImages:
         grid = make_grid(num_rings)
         if self.small.valid_share > ALL_SHOWN:
             return np.ones(len(grid), np.bool_)
-        rays_cam = rotate_points(grid.directions.astype(np.float64), pose.R_cam_from_world)
-        return np.asarray(self.panorama.is_valid[compute_indices(rays_cam, self.panorama.is_valid.shape[1])])
+        shown = self.find_cone(num_rings, pose).contains(grid.directions)
+        rays_cam = rotate_points(grid.directions[shown].astype(np.float64), pose.R_cam_from_world)
+        is_valid = self.panorama.is_valid
+        shown[shown] = is_valid[compute_indices(rays_cam, is_valid.shape[1])]
+        return shown
 
     def find_cone(self, num_rings: int, pose: Pose) -> Cone:
         """Return the cone, in the map's axes, around the grid cells that the photo at a pose shows."""

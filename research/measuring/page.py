@@ -30,6 +30,7 @@ from ..scene import Query, Scene, read_scene
 from ..synthetic.world import PHOTO_FOV_DEG, cut_photo, make_query, make_world, write_photo
 from .claims import Points, Trial
 from .confidence import DAMAGED_SCANS, damage_trial
+from .kernels import MEASURED, list_lines
 from .speed import clean_queries, kernel_table, size_table
 
 EPILOG = """\
@@ -42,6 +43,7 @@ each with a calibration cameras/NAME.camera.json; else they are panoramas. Damag
 are made from the panoramas of the variant clean, or of all if there is none.
 """
 ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "BENCHMARK.md"
 PAPER_SETTINGS = PaperSettings()
 NUM_BY_PAPER = 2  # panoramas of each scene
 CONFIDENCES = (0.0, 0.5, 0.9, 0.99, 1.0)
@@ -311,9 +313,10 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Arguments) -> int:
-    """Measure, and write the page."""
+    """Measure, and write the page; beside BENCHMARK.md it writes the kernels with which that was made."""
     arguments.check_least(damaged=0, photos=0)
     head = page_head(arguments)
+    kernels = list_lines(git_commit())
     bench = Bench(arguments)
     bench.measure()
     page = "\n".join(chain([head], bench.sections())).rstrip("\n") + "\n"
@@ -321,4 +324,6 @@ def run(arguments: Arguments) -> int:
         print(page, end="")
     else:
         write_atomically(arguments.out, page.encode())
+        if Path(arguments.out).resolve() == PAGE:
+            write_atomically(MEASURED, "".join(f"{line}\n" for line in kernels).encode())
     return 0

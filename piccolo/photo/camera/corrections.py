@@ -173,50 +173,45 @@ def displace_in_pinhole(
 ) -> None:
     """Write where points (3, N) are seen by a pinhole with corrections (5,), and derivatives (5, 3, N).
 
-    A ray is u = q / |q|, q = (1, -x, -y), and moves by (I - u u^T) dq / |q|. What is not ahead stays.
+    A ray is u = q / |q|, q = (1, -x, -y), and moves by (I - u u^T) dq / |q|: `by_x` and `by_y` where x or y
+    grows. What is not ahead stays.
     """
     R = R_lens_from_cam
     wide = np.float32(math.exp(values[0]))
     high = np.float32(math.exp(values[0] + values[1]))
-    turned = np.empty(3, np.float32)
-    step = np.empty((5, 2), np.float32)
     for n in range(points.shape[1]):
-        square = F0
-        for i in range(3):
-            turned[i] = R[i, 0] * points[0, n] + R[i, 1] * points[1, n] + R[i, 2] * points[2, n]
-            square += turned[i] * turned[i]
-        r = np.float32(math.sqrt(square))
-        is_ahead = turned[0] > least_ahead * r
+        a = points[0, n]
+        b = points[1, n]
+        c = points[2, n]
+        r = np.float32(math.sqrt(a * a + b * b + c * c))
+        depth = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
+        is_ahead = depth > least_ahead * r
         is_shown[n] = F1 if is_ahead else F0
         if not is_ahead:
             displaced[:, n] = points[:, n]
             moves[:, :, n] = F0
             continue
-        x = -turned[1] / turned[0]
-        y = -turned[2] / turned[0]
+        x = -(R[1, 0] * a + R[1, 1] * b + R[1, 2] * c) / depth
+        y = -(R[2, 0] * a + R[2, 1] * b + R[2, 2] * c) / depth
         r2 = x * x + y * y
+        x_wide = x * wide
+        y_wide = y * high
         scale = F1 + values[4] * r2
-        step[0, 0] = x * wide * scale
-        step[0, 1] = y * high * scale
-        step[1, 0] = F0
-        step[1, 1] = step[0, 1]
-        step[2, 0] = F1
-        step[2, 1] = F0
-        step[3, 0] = F0
-        step[3, 1] = F1
-        step[4, 0] = x * wide * r2
-        step[4, 1] = y * high * r2
-        x_new = step[0, 0] + values[2]
-        y_new = step[0, 1] + values[3]
+        x_scaled = x_wide * scale
+        y_scaled = y_wide * scale
+        x_new = x_scaled + values[2]
+        y_new = y_scaled + values[3]
         ahead = F1 / np.float32(math.sqrt(F1 + x_new * x_new + y_new * y_new))
         left = -x_new * ahead
         up = -y_new * ahead
+        far = r * ahead
         for i in range(3):
-            displaced[i, n] = r * (R[0, i] * ahead + R[1, i] * left + R[2, i] * up)
-        for k in range(5):
-            along = -left * step[k, 0] - up * step[k, 1]
-            of_x = -along * ahead
-            of_y = -step[k, 0] - along * left
-            of_z = -step[k, 1] - along * up
-            for i in range(3):
-                moves[k, i, n] = r * ahead * (R[0, i] * of_x + R[1, i] * of_y + R[2, i] * of_z)
+            ray = R[0, i] * ahead + R[1, i] * left + R[2, i] * up
+            by_x = far * (left * ray - R[1, i])
+            by_y = far * (up * ray - R[2, i])
+            displaced[i, n] = r * ray
+            moves[0, i, n] = x_scaled * by_x + y_scaled * by_y
+            moves[1, i, n] = y_scaled * by_y
+            moves[2, i, n] = by_x
+            moves[3, i, n] = by_y
+            moves[4, i, n] = r2 * (x_wide * by_x + y_wide * by_y)
