@@ -10,6 +10,7 @@ import rooms
 from piccolo.cloud import layers
 from piccolo.cloud.octree import build_octree
 from piccolo.evidence import covariance
+from piccolo.evidence.blocks import sort_by_block
 from piccolo.evidence.examine import examine
 from piccolo.evidence.scan_errors import gap_variance
 from piccolo.geometry.pose import exp_so3
@@ -170,7 +171,7 @@ def test_layers_are_an_error_that_photos_have_in_common():
 
 def test_planes_split_a_place_into_parts_of_a_quarter_and_more():
     points = Cells(rng_offsets(), rng_offsets(), np.ones(3000, np.float32), np.zeros(3))
-    points, begins = covariance.sort_by_block(points)
+    points, begins = sort_by_block(points)
     is_beyond = covariance.split_by_planes(points, begins)
     assert is_beyond.shape == (24, len(begins) - 1)
     shares = (is_beyond @ np.diff(begins) / 3000).reshape(3, 8)

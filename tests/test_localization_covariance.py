@@ -10,10 +10,11 @@ import pytest
 import rooms
 from made_up import PARTIAL, WHOLE
 from rooms import WORKERS, as_panorama, errors, query
+from scipy.linalg import eigh
 
 from piccolo.cloud.readers.reader import PointSource, RawCloud
 from piccolo.cloud.stream import CloudStream
-from piccolo.evidence import covariance
+from piccolo.evidence import blocks, covariance
 from piccolo.evidence.examine import examine
 from piccolo.geometry.nearness import ROOM_RANGE
 from piccolo.geometry.pose import Pose, exp_so3, step, yaw_rotation
@@ -67,7 +68,7 @@ def test_gradients_as_left_out_are_those_at_the_pose_without_the_block():
     right = np.einsum("bni,bn->bi", rows, wanted)
     x = np.linalg.solve(matrices.sum(axis=0), right.sum(axis=0))
     gradients = np.einsum("bni,bn->bi", rows, rows @ x - wanted)
-    found = covariance.jackknife_gradients(gradients, matrices)
+    found = blocks.jackknife_gradients(gradients, matrices)
     for k in (0, 7, 19):
         others = np.delete(np.arange(20), k)
         alone = np.linalg.solve(matrices[others].sum(axis=0), right[others].sum(axis=0))
@@ -87,6 +88,35 @@ def test_hessian_predicts_the_gradient_a_step_away(found):
         before, after = _gradients(problem, (pose, moved), pose.center_world)
         expected = hessian @ delta
         assert np.linalg.norm(after - before - expected) < 0.5 * np.linalg.norm(expected)
+
+
+def test_a_photos_grid_turns_it_and_does_not_move_it(found):
+    """Its rows and columns displaced together are a turn, or a horizon, whose errors count by themselves."""
+    prepared, pose, _ = found
+    candidate = examine(prepared, pose)
+
+    def tell(share):
+        method = replace(METHOD, pixel_share=share)
+        asked = replace(prepared, profile=replace(prepared.profile, method=method))
+        return covariance.estimate_covariance(asked, candidate, WORKERS).gaussian.covariance
+
+    added = tell(0.5) - tell(0.0)
+    expected = np.diag(np.repeat([(0.5 * prepared.pixel) ** 2, 0.0], 3))
+    np.testing.assert_allclose(added, expected, atol=1e-6 * expected.max())
+
+
+def test_steps_displace_near_points_as_much_as_turns_do(found, monkeypatch):
+    """A tenth of the points is near: they tell most of a position, and the median range would ignore them."""
+    prepared, pose, _ = found
+    points = _points(prepared, pose)
+    scale = np.where(np.arange(points.offsets.shape[1]) % 10 == 0, 2.0, 20.0).astype(np.float32)
+    points = points._replace(offsets=points.offsets * scale)
+    ranges = []
+    monkeypatch.setattr(covariance, "compute_hessian", lambda *rest: ranges.append(rest[3]) or np.eye(6))
+    covariance.compute_covariance(prepared.photo, points, pose, WHOLE)
+    median = np.median(np.linalg.norm(points.offsets, axis=0))
+    assert set(ranges) == {covariance.compute_acting_range(points)}
+    assert max(ranges) < 0.5 * median
 
 
 def test_sandwich_of_independent_blocks_is_the_textbook_covariance():
@@ -138,7 +168,7 @@ def test_in_a_place_ten_times_as_large_a_position_is_known_a_tenth_as_well(found
 
 @pytest.mark.parametrize("num_rough", [0, 1, 2, 3])
 def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, num_rough):
-    """Those that have one count alike."""
+    """Of those that have one the one that tells more counts."""
     prepared, pose, _ = found
     points = _points(prepared, pose)
     ways = (*WHOLE.steps, WHOLE.rough_steps)
@@ -161,35 +191,66 @@ def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, num_r
         assert matrix is None
     else:
         told = [by(steps) for steps in ways[num_rough : max(num_rough + 1, 2)]]
-        mean = np.linalg.inv(np.mean(np.linalg.inv(told), axis=0))
-        np.testing.assert_allclose(matrix, mean, rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(matrix, told_more(*told), rtol=1e-6, atol=1e-12)
+
+
+def told_more(one, other=None):
+    """The covariance that tells more in each direction, by the axes in which both have no correlations."""
+    if other is None:
+        return one
+    ratios, axes = eigh(one, other)  # axes^T other axes = 1
+    back = np.linalg.inv(axes)
+    return back.T @ np.diag(np.minimum(ratios, 1.0)) @ back
 
 
 def test_a_part_of_the_sphere_has_few_blocks_that_tell(found):
     prepared, pose, _ = found
     points = _points(prepared, pose)
+    ahead = blocks.take(points, pose.R_cam_from_world[0] @ points.offsets > 0.0)
     whole, part = (
-        covariance.compute_covariance(prepared.photo, points, pose, profile) for profile in (WHOLE, PARTIAL)
+        covariance.compute_covariance(prepared.photo, ahead, pose, profile) for profile in (WHOLE, PARTIAL)
     )
-    num_blocks = len(covariance.sort_by_block(points)[1]) - 1
+    num_blocks = np.count_nonzero(np.diff(blocks.sort_by_block(ahead)[1]))
     np.testing.assert_allclose(part, covariance.few_blocks_factor(num_blocks) * whole, rtol=5e-3)
     assert covariance.few_blocks_factor(100) == pytest.approx(100.0 / 93.0)
 
 
+def test_errors_of_upright_edges_go_together():
+    """Points of a column have one error; of points that are not all around those of a block."""
+    rng = np.random.default_rng(6)
+    offsets = rng.normal(size=(3, 20_000)).astype(np.float32)
+    points = Cells(offsets, offsets + 1.0, np.ones(20_000, np.float32), np.zeros(3))
+    found, begins = blocks.sort_by_column(points)
+    assert len(begins) == 25
+    azimuths = np.degrees(np.arctan2(found.offsets[1], found.offsets[0])) + 180.0
+    assert np.ptp(azimuths[begins[7] : begins[8]]) <= 15.0
+    assert np.ptp(found.offsets[2, begins[7] : begins[8]]) > 5.0
+    np.testing.assert_array_equal(np.sort(found.offsets), np.sort(offsets))
+    some = blocks.take(points, offsets[0] > 0.0)
+    for found, expected in zip(blocks.sort_by_column(some), blocks.sort_by_block(some), strict=True):
+        np.testing.assert_array_equal(found[0], expected[0])
+
+
 def test_a_direction_that_one_image_does_not_tell_is_told_by_the_other():
     blind = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 1e12])
-    merged = covariance.merge_covariances([blind, np.eye(6)])
-    np.testing.assert_allclose(merged, np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 2.0]), rtol=1e-9)
+    for told in ((blind, 4.0 * np.eye(6)), (4.0 * np.eye(6), blind)):
+        merged = covariance.merge_covariances(*told)
+        np.testing.assert_allclose(merged, np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 4.0]), rtol=1e-9)
 
 
 def block_sums(rng, is_ahead, apart):
     """Sums (B, 29) at the best pose of all blocks, where that of those ahead is `apart` (6,) from others'."""
     rows = rng.normal(size=(len(is_ahead), 40, 6))
     wanted = rng.normal(size=(len(is_ahead), 40)) + np.einsum("bni,i,b->bn", rows, apart, is_ahead - 0.5)
+    return sums_of(rows, wanted)
+
+
+def sums_of(rows, wanted):
+    """Sums (B, 29) of blocks at the best pose of all, by rows (B, n, 6) and values (B, n)."""
     matrices = np.swapaxes(rows, 1, 2) @ rows
     right = np.einsum("bni,bn->bi", rows, wanted)
     gradients = matrices @ np.linalg.solve(matrices.sum(axis=0), right.sum(axis=0)) - right
-    sums = np.zeros((len(is_ahead), 29))
+    sums = np.zeros((len(rows), 29))
     sums[:, 2:8] = gradients
     sums[:, 8:] = matrices[:, *np.triu_indices(6)]
     return sums
@@ -198,15 +259,34 @@ def block_sums(rng, is_ahead, apart):
 def test_halves_that_ask_for_other_poses_score_far_beyond_chance():
     rng = np.random.default_rng(2)
     is_ahead = rng.permuted(np.tile(np.arange(150) % 2 == 0, (40, 1)), axis=1)
-    by_chance = [covariance.score_halves(block_sums(rng, is_ahead[0], np.zeros(6)), is_ahead) for _ in "1234"]
+    alone = np.arange(150)
+    none = np.zeros(6)
+    by_chance = [covariance.score_halves(block_sums(rng, is_ahead[0], none), is_ahead, alone) for _ in "1234"]
     assert np.mean(by_chance) == pytest.approx(1.0, abs=0.1)
     assert np.percentile(by_chance, 95) < METHOD.halves_score
     sums = block_sums(rng, is_ahead[7], np.array([0.0, 0, 0, 0, 0, 0.4]))
-    scores = covariance.score_halves(sums, is_ahead)
+    scores = covariance.score_halves(sums, is_ahead, alone)
     assert scores.argmax() == 7
     assert scores[7] > 3.0 * METHOD.halves_score
     sums[np.flatnonzero(is_ahead[7])[12:]] = 0.0
-    assert covariance.score_halves(sums, is_ahead)[7] == 0.0
+    assert covariance.score_halves(sums, is_ahead, alone)[7] == 0.0
+
+
+def test_halves_that_errors_along_edges_set_apart_score_as_by_chance():
+    """By gradients of single blocks, right photos would seem to be stitched wrongly."""
+    rng = np.random.default_rng(4)
+    wide = np.arange(160) // 4
+    is_ahead = rng.permuted(np.tile(np.arange(40) % 2 == 0, (40, 1)), axis=1)[:, wide]
+    found = []
+    for _ in range(4):
+        rows = rng.normal(size=(160, 40, 6))
+        wanted = rng.normal(size=(160, 40)) + np.einsum("bni,bi->bn", rows, rng.normal(size=(40, 6))[wide])
+        sums = sums_of(rows, wanted)
+        scores = [covariance.score_halves(sums, is_ahead, which) for which in (wide, np.arange(160))]
+        found.append(np.mean(scores, axis=1))
+    as_wide, as_single = np.mean(found, axis=0)
+    assert as_wide == pytest.approx(1.0, abs=0.25)
+    assert as_single > 2.0 * as_wide
 
 
 def test_a_pose_that_is_not_the_best_of_all_does_not_set_halves_apart():
@@ -215,9 +295,10 @@ def test_a_pose_that_is_not_the_best_of_all_does_not_set_halves_apart():
     is_ahead = np.arange(150) % 2 == 0
     sums = block_sums(rng, is_ahead, np.zeros(6))
     sums[:20:2] *= 100.0
-    expected = covariance.score_halves(sums, is_ahead[None])
-    sums[:, 2:8] += covariance.fill_symmetric(sums[:, 8:]) @ np.full(6, 0.01)
-    np.testing.assert_allclose(covariance.score_halves(sums, is_ahead[None]), expected, rtol=0.3)
+    alone = np.arange(150)
+    expected = covariance.score_halves(sums, is_ahead[None], alone)
+    sums[:, 2:8] += blocks.fill_symmetric(sums[:, 8:]) @ np.full(6, 0.01)
+    np.testing.assert_allclose(covariance.score_halves(sums, is_ahead[None], alone), expected, rtol=0.3)
     assert expected < METHOD.halves_score
 
 

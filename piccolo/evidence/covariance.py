@@ -2,37 +2,44 @@
 
 import math
 from collections.abc import Sequence
+from functools import reduce
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..geometry.levenberg_marquardt import GRADIENT, MATRIX, NUM_SUMS
 from ..geometry.nearness import ROOM_RANGE
 from ..geometry.pose import Pose, rotate_points, step, step_between, yaw_rotation
 from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
-from ..geometry.sphere import compute_indices, find_cell, make_grid
+from ..geometry.sphere import BLOCK_RINGS, compute_indices, find_cell, make_grid
 from ..judge.candidate import Candidate
 from ..judge.case import UNKNOWN_ERRORS, Errors
-from ..optimize.channel_loss import ChannelProblem, channel_equations, descend_channels, equations_by_part
+from ..optimize.channel_loss import ChannelProblem, channel_equations, descend_channels
 from ..photo.panorama.local_normalization import LEVELS_PER_UNIT, to_levels
 from ..photo.panorama.texels import Texels
 from ..problem.photo_images import PhotoImages
 from ..problem.problem import Problem
 from ..problem.profile import Profile
 from ..problem.stages import LAST
-from ..system.arrays import Array, Int64s, Mask
+from ..system.arrays import Array, Int64s, Integers, Mask
 from ..system.jobs.threads import Workers
 from ..system.kernels.jit import kernel
 from ..views.view import Cells
+from .blocks import (
+    ERROR_RINGS,
+    block_gradients,
+    fill_symmetric,
+    sort_by_block,
+    sort_by_column,
+    sum_by_block,
+    take,
+)
 from .comparison import mask_occluders
 from .contradictions import contradictions
 from .scan_errors import layer_covariance, scan_covariance
 from .verification import draw_near, place_by_matches
 
-ERROR_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
 LEAST_INFORMATION = 1e-12  # in any direction, as a fraction of that in the best-known direction
 LEAST_BLOCKS = 13  # with fewer, errors in six dimensions can't be estimated
-ONE_BLOCK = 1.001  # above 1, so that one block may hold all information
 UNCALIBRATED = 0.005  # deviation of a focal length's logarithm from which the camera is not calibrated
 LEAST_STEP_RANGE = 0.005 / math.radians(0.1)  # [m] least range: steps for nearer points would drown in noise
 LEAST_ACTING = 0.25  # [m] distance of points that count: nearer ones are noise, as cameras stand clear
@@ -57,20 +64,6 @@ def write_gradients(problem: ChannelProblem, rotations: Array, centers: Array, g
             gradients[k, i] = sums[GRADIENT + i]
 
 
-def fill_symmetric(upper: Array) -> Array:
-    """Return symmetric matrices (..., 6, 6) from their upper triangles (..., 21), row by row."""
-    matrix = np.zeros((*upper.shape[:-1], 6, 6))
-    rows, columns = np.triu_indices(6)
-    matrix[..., rows, columns] = matrix[..., columns, rows] = upper
-    return matrix
-
-
-def take(points: Cells, which: Mask | NDArray[np.intp]) -> Cells:
-    """Return some of the points, by a mask or by their indices in a new order."""
-    offsets, channels, weights = (np.ascontiguousarray(values[..., which]) for values in points[:3])
-    return Cells(offsets, channels, weights, points.center_map)
-
-
 def remove_poles(points: Cells, pose: Pose) -> Cells:
     """Remove the points around a pose that lie within POLE_DEG of the photo's poles."""
     heights = pose.R_cam_from_world[2] @ points.offsets
@@ -82,11 +75,6 @@ def remove_hidden(points: Cells, is_valid: Mask, pose: Pose) -> Cells:
     """Remove the points around a pose that lie in pixels (H, W) of the photo that are not valid."""
     rays_cam = rotate_points(points.offsets.T.astype(np.float64), pose.R_cam_from_world)
     return take(points, is_valid[compute_indices(rays_cam, is_valid.shape[1])])
-
-
-def compute_median_range(points: Cells) -> float:
-    """Return the median distance [m] of points from the camera that they surround."""
-    return float(np.median(np.linalg.norm(points.offsets, axis=0)))
 
 
 def compute_acting_range(points: Cells) -> float:
@@ -108,14 +96,15 @@ def compute_std_of_fit(covariance: Array, acting_range: float) -> float:
     return largest_std(covariance) / max(acting_range, ROOM_RANGE)
 
 
-def compute_hessian(problem: ChannelProblem, pose: Pose, turn: float, median_range: float) -> Array:
+def compute_hessian(problem: ChannelProblem, pose: Pose, turn: float, acting_range: float) -> Array:
     """Return the Hessian (6, 6) of the robust loss, by differences over steps as large as errors are.
 
     The Gauss-Newton matrix ignores that the loss flattens, and would make deviations several times too small.
-    The points of the problem surround the pose. Steps of the position are `turn` [rad] times their median
-    range [m].
+    The points of the problem surround the pose. Steps of the position are `turn` [rad] times their acting
+    range [m], so that they displace points as much as steps of the rotation do: steps that suit far points
+    would displace near ones, which tell most of a position, to where the loss is flat.
     """
-    sizes = np.repeat([turn, turn * max(median_range, LEAST_STEP_RANGE)], 3)
+    sizes = np.repeat([turn, turn * max(acting_range, LEAST_STEP_RANGE)], 3)
     ends = [step(pose, sign * delta) for delta in np.diag(sizes) for sign in (1.0, -1.0)]
     rotations = np.array([end.R_cam_from_world for end in ends])
     centers = np.array([end.center_world for end in ends]) - pose.center_world
@@ -123,42 +112,6 @@ def compute_hessian(problem: ChannelProblem, pose: Pose, turn: float, median_ran
     write_gradients(problem, rotations, centers, gradients)
     rows = (gradients[::2] - gradients[1::2]) / (2.0 * sizes[:, None])
     return np.asarray(0.5 * (rows + rows.T))
-
-
-def sort_by_block(points: Cells) -> tuple[Cells, Int64s]:
-    """Sort the points around a camera by the block of the sphere in which each lies.
-
-    Return also where each block begins, and the number of points (B + 1,).
-    """
-    ranges = np.linalg.norm(points.offsets, axis=0)
-    blocks = find_cell(points.offsets.T / ranges[:, None], ERROR_RINGS)
-    begins = np.concatenate([[0], np.cumsum(np.bincount(blocks))])
-    return take(points, np.argsort(blocks, kind="stable")), begins
-
-
-def sum_by_block(problem: ChannelProblem, pose: Pose, begins: Int64s) -> Array:
-    """Sum the normal equations (B, 29) over each block's points around a pose, from its `begins` (B + 1,)."""
-    sums = np.empty((len(begins) - 1, NUM_SUMS))
-    equations_by_part(problem, pose.R_cam_from_world, np.zeros(3), begins, sums)
-    return sums
-
-
-def block_gradients(sums: Array) -> Array:
-    """Return jackknife gradients (B, 6), in the camera's frame, from the sums (B, 29) of blocks."""
-    shown = sums[sums[:, GRADIENT:MATRIX].any(axis=1)]  # of what the photo shows
-    return jackknife_gradients(shown[:, GRADIENT:MATRIX], fill_symmetric(shown[:, MATRIX:]))
-
-
-def jackknife_gradients(gradients: Array, matrices: Array) -> Array:
-    """Return gradients (B, n) as at a pose found without each block, by matrices (B, n, n).
-
-    The more information one block holds, the more the pose has followed its errors, and the less of them its
-    gradient shows: g <- (I - A_b A^-1)^-1 g, with the block's part A_b of the Gauss-Newton matrix A
-    (the estimate CR3 of Bell and McCaffrey, 2002).
-    """
-    shares = matrices @ np.linalg.pinv(matrices.sum(axis=0))
-    identity = np.eye(gradients.shape[1])
-    return np.asarray(np.linalg.solve(ONE_BLOCK * identity - shares, gradients[..., None])[..., 0])
 
 
 def sandwich_covariance(hessian: Array, gradients: Array) -> Array | None:
@@ -182,13 +135,18 @@ def few_blocks_factor(num_blocks: int) -> float:
     return num_blocks / (num_blocks - 7.0)
 
 
-def merge_covariances(found: Sequence[Array]) -> Array:
-    """Return the covariance (6, 6) whose information is the mean of that of several.
+def merge_covariances(one: Array, other: Array) -> Array:
+    """Return the covariance (6, 6) that is in each direction that of the two which tells more.
 
-    Estimated from few blocks, the least of the covariances may be so small by chance.
+    The directions are those in which neither has correlations; `shares` are how much of the information of
+    both is by the first. A mean would follow the image that tells less, and may be several times too large.
     """
-    information, axes = np.linalg.eigh(np.mean(np.linalg.inv(found), axis=0))
-    return np.asarray((axes / np.maximum(information, LEAST_INFORMATION * information[-1])) @ axes.T)
+    by_one = np.linalg.inv(one)
+    information, axes = np.linalg.eigh(by_one + np.linalg.inv(other))
+    axes = axes / np.sqrt(np.maximum(information, LEAST_INFORMATION * information[-1]))
+    shares, turns = np.linalg.eigh(axes.T @ by_one @ axes)
+    axes = axes @ turns
+    return np.asarray((axes / np.maximum(shares, 1.0 - shares)) @ axes.T)
 
 
 def make_problem(points: Cells, image: Texels) -> ChannelProblem:
@@ -198,17 +156,20 @@ def make_problem(points: Cells, image: Texels) -> ChannelProblem:
     )
 
 
-def score_halves(sums: Array, is_ahead: Mask) -> Array:
+def score_halves(sums: Array, is_ahead: Mask, wide: Integers) -> Array:
     """Score (S,) how much two halves disagree about a pose, by blocks' sums (B, 29); by chance 1 in the mean.
 
     `is_ahead` (S, B) is True for the blocks of one half. The score is the sum of g^T A^-1 g over both halves,
     g their gradients at the pose of all points, as in the test of Rao (1948), divided by what is expected of
-    it from the gradients of single blocks; 0 where a half has too few blocks.
+    it from the gradients of wide blocks, of which each block is in number `wide` (B,); 0 where a half has too
+    few blocks.
     """
     gradients = sums[:, GRADIENT:MATRIX]
     matrices = fill_symmetric(sums[:, MATRIX:])
     inverse = np.linalg.pinv(matrices.sum(axis=0))
-    left_out = jackknife_gradients(gradients, matrices)
+    of_wide = np.zeros((int(wide.max()) + 1, NUM_SUMS))
+    np.add.at(of_wide, wide, sums)
+    left_out = block_gradients(of_wide)
     gradients = gradients - matrices @ (inverse @ gradients.sum(axis=0))
     scores = np.zeros(len(is_ahead))
     for is_half in (is_ahead.astype(float), 1.0 - is_ahead):
@@ -257,6 +218,7 @@ def disagreement(
     points, begins = sort_by_block(points)
     blocks_map = make_grid(ERROR_RINGS).directions[: len(begins) - 1]
     is_ahead = NORMALS @ pose.R_cam_from_world @ blocks_map.T > 0.0
+    wide = find_cell(blocks_map, BLOCK_RINGS)
     images = photo.image("fine"), photo.image("full")
     sums = sum_by_block(make_problem(points, images[-1]), pose, begins)
 
@@ -266,14 +228,14 @@ def disagreement(
         return ends[0][0] + ends[1][0], np.array([delta for _, delta in ends])
 
     added = np.zeros((6, 6))
-    scores = score_halves(sums, is_ahead)
+    scores = score_halves(sums, is_ahead, wide)
     tried = [k for k in np.argsort(-scores)[:NUM_TRIED_PLANES] if scores[k] > least]
     if tried:
         ends = workers.map(separate, list(is_ahead[tried]), "covariance")
         steps = min(ends, key=lambda end: end[0])[1]
         added += (1.0 - (least / scores[tried[0]]) ** 2) * (covariance + 0.5 * steps.T @ steps)
     is_beyond = split_by_planes(points, begins)
-    scores = score_halves(sums, is_beyond)
+    scores = score_halves(sums, is_beyond, wide)
     seam = int(scores.argmax())
     if scores[seam] > SEAM_SCORE:
         one, other = np.linalg.norm(separate(is_beyond[seam])[1].reshape(2, 2, 3), axis=2)
@@ -284,27 +246,28 @@ def disagreement(
 def compute_covariance(photo: PhotoImages, points: Cells, pose: Pose, profile: Profile) -> Array | None:
     """Return the covariance (6, 6) [rad, m] in the camera's frame.
 
-    Noise and stitching roughen the loss in the finest image; in the next one it is smoother. The covariances
-    by both images are averaged, without one whose loss is too rough; if both are too rough, a third image is
-    used. Occluders may be masked in `photo`. If the unmasked photo shows a part of the sphere only, the
-    covariance is enlarged, as it rests on few blocks (`few_blocks_factor`). The points surround the pose.
+    Noise and stitching roughen the loss in the finest image, until it tells nothing of some direction; in the
+    next one it is smoother. Of both images the one that tells more of a direction counts, without one whose
+    loss is too rough; if both are too rough, a third image is used. Occluders may be masked in `photo`. If
+    the unmasked photo shows a part of the sphere only, the covariance is enlarged, as it rests on few blocks
+    (`few_blocks_factor`). The points surround the pose.
     """
     if points.offsets.shape[1] == 0:
         return None
-    median_range = compute_median_range(points)
-    points, begins = sort_by_block(points)
+    acting_range = compute_acting_range(points)
+    points, begins = sort_by_block(points) if profile.has_few_blocks else sort_by_column(points)
     found: list[Array] = []
     for steps in (*profile.steps, profile.rough_steps):
         if found and steps is profile.rough_steps:
-            return merge_covariances(found)
+            break
         problem = make_problem(points, photo.image(steps.image))
-        hessian = compute_hessian(problem, pose, steps.turn, median_range)
+        hessian = compute_hessian(problem, pose, steps.turn, acting_range)
         gradients = block_gradients(sum_by_block(problem, pose, begins))
         covariance = sandwich_covariance(hessian, gradients)
         if covariance is not None:
             factor = few_blocks_factor(len(gradients)) if profile.has_few_blocks else 1.0
             found.append(steps.inflation * factor * covariance)
-    return found[0] if found else None
+    return reduce(merge_covariances, found) if found else None
 
 
 def split_errors(problem: Problem, pose: Pose, covariance: Array) -> PoseGaussian:
@@ -374,8 +337,9 @@ def estimate_covariance(
     is_calibrated = prior is None or prior.deviation < UNCALIBRATED
     method = problem.method
     turn = (method.pixel_share if is_calibrated else method.uncalibrated_share) * problem.pixel
-    move = turn * compute_median_range(points)
-    of_grid = np.diag(np.repeat([turn**2, move**2], 3))  # of pixels and stitching, alike in all blocks
+    # of pixels and stitching, alike in all blocks: rows and columns that are displaced together turn the
+    # photo; how far they move it is among the errors of its geometry: of its horizon or principal point
+    of_grid = np.diag(np.repeat([turn**2, 0.0], 3))
     own = turn_positions(covariance, turned) + of_grid
     common = scan_covariance(problem.scan_map, acting_range)
     common = common + (1.0 - profile.own_share) * own

@@ -21,7 +21,7 @@ from ..photo.panorama.texels import Texels
 from ..problem.stages import Limits
 from ..system.arrays import Array, Array32, Int64s
 from ..views.view import Cells
-from .covariance import jackknife_gradients, sort_by_block, take
+from .blocks import jackknife_gradients, sort_by_block, take
 
 MASKED_LOSS = 0.25  # loss of a point on masked pixels, as a multiple of the square of the loss's scale
 # factor on the Gauss-Newton matrix, which ignores that the loss flattens: with this factor, 95 % of the true

@@ -61,13 +61,15 @@ class DifferenceSteps(NamedTuple):
     """Image and step with which the loss is differentiated for a covariance."""
 
     image: ImageName  # of the photo
-    turn: float  # [rad] step of the differences; a move is this times the median range
-    inflation: float  # so that 95 % of true poses lie in the 95 % region (tools/benchmark.py calibration)
+    turn: float  # [rad] step of the differences; a move is this times the acting range
+    # by trials in made rooms, for whose errors less is too narrow, and in scans with a point every 10 cm, for
+    # whose errors more is too wide
+    inflation: float
 
 
 COLOR_STEPS = (
-    DifferenceSteps("full", math.radians(0.1), 1.1),
-    DifferenceSteps("fine", math.radians(0.3), 0.36),
+    DifferenceSteps("full", math.radians(0.1), 1.5),
+    DifferenceSteps("fine", math.radians(0.3), 1.0),
 )
 # for dark, noisy photos; there are too few to calibrate its factor
 ROUGH_COLOR_STEPS = DifferenceSteps("middle", math.radians(0.3), 1.0)
@@ -115,7 +117,7 @@ class Profile:
     discount: float = 1.0  # factor of scores by shape: on few blocks chance explains more
     # geometry and errors
     fits_sphere: bool = True  # what a panorama shows of the sphere is compared with the scan
-    steps: tuple[DifferenceSteps, ...] = COLOR_STEPS  # of a covariance, which is the mean by these
+    steps: tuple[DifferenceSteps, ...] = COLOR_STEPS  # of a covariance: that of these which tells more
     rough_steps: DifferenceSteps = ROUGH_COLOR_STEPS  # if all of these are too rough
     own_share: float = 1.0  # of the variance by images: errors that other photos do not have in common
     has_few_blocks: bool = False  # so that their covariance is too small in the mean
