@@ -6,7 +6,7 @@ import pytest
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add, subtract
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.together.relation import compute_match_loss, list_weak_steps, relate
+from piccolo.together.relation import compute_information, compute_match_loss, list_weak_steps, relate
 
 TRUE = Pose(yaw_rotation(0.4), np.array([1.0, -2.0, 1.5]))
 
@@ -57,7 +57,8 @@ def test_exact_matches_give_the_pose_from_a_start_beside_it():
 
 def test_weak_steps_of_a_wall_move_along_it_and_turn_back():
     """Both ways, so that what lies ahead stays where it is seen."""
-    steps = np.array(list_weak_steps(_matches_of_wall(np.random.default_rng(0), 40, 0.0, 0.0), TRUE))
+    matches = _matches_of_wall(np.random.default_rng(0), 40, 0.0, 0.0)
+    steps = np.array(list_weak_steps(compute_information(matches, TRUE)))
     assert np.allclose(steps[::2], -steps[1::2])
     along = (steps[:, 3:] @ TRUE.R_cam_from_world.T)[:, 1:]
     assert (np.linalg.norm(along, axis=1) > 0.8 * np.linalg.norm(steps[:, 3:], axis=1)).all()

@@ -41,6 +41,7 @@ from .links import (
 from .members import Member, Shot, find_members
 from .mirrored import refuse_mirrored
 from .nearby import localize_nearby
+from .optima import widen_unsure
 
 NUM_ANCHORS = 5  # poses of a photo from which a place of the group may follow, the likeliest
 LEAST_LIKELY = 1e-3  # chosen: probability of a pose from which a place of the group may follow
@@ -273,9 +274,10 @@ def judge_group(
     There are no results if only one photo belongs to it, and no other photo is sure to have been taken there.
     """
     best, *elsewhere = tested
-    own, expected = locate_all(group.links, best.places, best.supports)
+    supports = widen_unsure(group.members, best.supports, means.workers)
+    own, expected = locate_all(group.links, best.places, supports)
     results = {}
-    for number, support in best.supports.items():
+    for number, support in supports.items():
         member = group.members[number]
         belongs = Shares(*support.shares[:2].tolist())
         is_sure = member.alone.status == LOCALIZED

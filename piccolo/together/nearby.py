@@ -10,6 +10,7 @@ import numpy as np
 
 from ..geometry.pose import Pose
 from ..judge.by_others import LEAST_NONE, believe_nearby
+from ..judge.conclude import take_pose
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result
 from ..localization.judging import judge
@@ -19,6 +20,7 @@ from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
 from ..system.arrays import Array
 from .members import Shot
+from .optima import spread_optima
 
 REACH = 1.0  # chosen: [m] from the nearest photo of those that were taken together
 
@@ -39,12 +41,20 @@ def localize_nearby(
         return None
     problem = replace(whole, scan_map=near)
     demand = shot.settings.demand
-    found = judge(find(problem, scan_map, means), means, demand, may_promote=False)
+    searched = find(problem, scan_map, means)
+    found = judge(searched, means, demand, may_promote=False)
     if found.best_pose is None or found.gaussian is None:
         return None
     elsewhere = compute_odds_elsewhere(scan_map, alone, located)
     belief = believe_nearby(found.belief, elsewhere, len(whole.scan_map.sparse) / len(near.sparse))
     result = found.take_belief(belief, demand.min_confidence)
+    if result.status != LOCALIZED:
+        return None
+    best = searched.selection.best
+    widened = found.gaussian.blur(spread_optima(searched.problem, best, found.gaussian, means.workers))
+    share = demand.accuracy.probability(widened) / demand.accuracy.probability(found.gaussian)
+    belief = replace(belief, within=share * belief.within)
+    result = take_pose(result, widened, scan_map).take_belief(belief, demand.min_confidence)
     return result if result.status == LOCALIZED else None
 
 

@@ -5,6 +5,7 @@ on both sides of the pose, along the two directions that the matches determine l
 optima that they find are added to the errors, weighted by how likely the optima are.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +34,8 @@ class Relation(NamedTuple):
 
 def relate(matches: Matches, near: Pose) -> Relation:
     """Return the best pose near one by matches, and its errors."""
-    starts = [near, *(add(near, step) for step in list_weak_steps(matches, near))]
+    information = compute_information(matches, near)
+    starts = [near, *(add(near, step) for step in list_weak_steps(information))]
     ends = [
         refine_on(matches, refine_on(matches, start, STEPS_OF_RELATION), STEPS_OF_RELATION)
         for start in starts
@@ -41,17 +43,27 @@ def relate(matches: Matches, near: Pose) -> Relation:
     losses = np.array([compute_match_loss(matches, end) for end in ends])
     best = ends[int(losses.argmin())]
     weights = np.exp(losses.min() - losses)
-    steps = np.array([subtract(end, best) for end in ends])
-    spread = (weights[:, None] * steps).T @ steps / weights.sum()
-    return Relation(best, DRAWN_INFLATION * match_covariance(matches, best) + spread)
+    errors = DRAWN_INFLATION * match_covariance(matches, best) + spread_over(ends, best, weights)
+    return Relation(best, errors)
 
 
-def list_weak_steps(matches: Matches, pose: Pose) -> list[Array]:
-    """Return steps (6,) in the directions that are least determined by the matches that agree with a pose."""
+def spread_over(ends: Sequence[Pose], pose: Pose, weights: Array) -> Array:
+    """Return the weighted mean square (6, 6) of the steps from a pose to other poses, as errors of it."""
+    steps = np.array([subtract(end, pose) for end in ends])
+    return np.asarray((weights[:, None] * steps).T @ steps / weights.sum())
+
+
+def compute_information(matches: Matches, pose: Pose) -> Array:
+    """Return the information (6, 6) that the matches that agree with a pose give of it, up to a factor."""
     agreeing = find_inliers(matches, pose, COS_EXACT)
     _, J = differentiate_rays(matches.points[agreeing], pose)
+    return np.asarray(np.einsum("kai,kaj->ij", J, J))
+
+
+def list_weak_steps(information: Array) -> list[Array]:
+    """Return steps (6,) in the directions in which a pose is least determined, by its information (6, 6)."""
     units = np.array([1.0, 1.0, 1.0, *[1.0 / RANGE_OF_TURN] * 3])
-    _, axes = np.linalg.eigh(np.einsum("kai,kaj->ij", J * units, J * units))
+    _, axes = np.linalg.eigh(units[:, None] * information * units)
     steps = []
     for direction in (units[:, None] * axes[:, :NUM_WEAK]).T:
         move = float(np.linalg.norm(direction[3:]))
