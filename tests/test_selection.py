@@ -13,7 +13,7 @@ from piccolo.geometry.pose import step
 from piccolo.judge.candidate import Selection
 from piccolo.judge.probability import Standing
 from piccolo.judge.result import nothing_found
-from piccolo.judge.selection import assess, credit_copies, list_drawn, select
+from piccolo.judge.selection import assess, credit_copies, list_drawn, list_mirrored, select
 from piccolo.localization import last_descent
 from piccolo.localization.attempts import end_search
 from piccolo.localization.beam import refine_matches
@@ -259,3 +259,17 @@ def test_a_pose_that_explains_less_than_half_of_a_sure_one_is_not_drawn(count, e
     assert list_drawn(PARTIAL, ranked) == [k <= expected for k in range(7)]
     assert list_drawn(WHOLE, ranked) == [k <= min(expected, 4) for k in range(7)]
     assert list_drawn(PARTIAL.by_views(), ranked) == [False] * 7
+
+
+@pytest.mark.parametrize(
+    ("differences", "one_is_mirrored", "expected"),
+    [
+        ((0.3, 1.1), False, [0, 1]),  # one tells that all were mirrored
+        ((-2.0, 1.1), False, []),  # the other tells more
+        ((-2.0, 1.1), True, [1]),  # similar things link a mirrored photo with one that is not
+        ((-2.0, 0.9), True, []),
+        ((), True, []),
+    ],
+)
+def test_linked_photos_are_mirrored_as_the_one_that_tells_most(differences, one_is_mirrored, expected):
+    assert list_mirrored(dict(enumerate(differences)), one_is_mirrored) == expected

@@ -1,7 +1,7 @@
 """Choose the best candidate by all evidence, and decide whether it is sure: pure functions of candidates."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import compress
 
 import numpy as np
@@ -130,13 +130,16 @@ def is_mirrored(method: Method, own: Candidate, mirrored: Candidate | None) -> b
     return (mirrored.num_matches or 0) > (own.num_matches or 0)
 
 
-def are_mirrored(differences: Sequence[float]) -> bool:
-    """Return True if linked photos fit better mirrored.
+def list_mirrored(differences: Mapping[int, float], one_is_mirrored: bool) -> list[int]:
+    """List which of linked photos were mirrored.
 
-    Given is for each photo the log odds of the mirrored photo less those of the photo as it is. The largest
-    difference, for or against, decides: that photo shows the most.
+    `differences` has the log odds of each mirrored photo less those of the photo as it is. The largest
+    difference, for or against, decides for all: that photo shows the most. Similar things may link a mirrored
+    photo with one that is not; so if one is known to be mirrored, each photo is decided by its own too.
     """
-    return max(differences, key=abs, default=0.0) >= LEAST_MIRRORED_ODDS
+    if max(differences.values(), key=abs, default=0.0) >= LEAST_MIRRORED_ODDS:
+        return list(differences)
+    return [k for k, value in differences.items() if one_is_mirrored and value >= LEAST_MIRRORED_ODDS]
 
 
 def credit_copies(standings: Sequence[Standing], is_copy: Sequence[bool]) -> list[Standing]:

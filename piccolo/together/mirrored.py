@@ -12,7 +12,7 @@ from ..judge.conclude import rule_out_mirrored
 from ..judge.probability import LOCALIZED, log_odds
 from ..judge.reasons import Reason
 from ..judge.result import Result
-from ..judge.selection import are_mirrored, assess, rank
+from ..judge.selection import assess, list_mirrored, rank
 from ..localization.attempts import plan_attempts
 from ..localization.means import Means
 from ..localization.run import make_attempts
@@ -22,9 +22,9 @@ from .members import Member
 def refuse_mirrored(
     results: Mapping[int, Result], members: Mapping[int, Member], means: Means, min_confidence: float
 ) -> dict[int, Result]:
-    """Return refused results of the localized photos among linked ones, if all were mirrored; else none.
+    """Return refused results of those localized photos among linked ones that were mirrored.
 
-    No mirrored photo is linked with one that is not. So the mirror images are searched if one of the photos
+    Mostly all linked photos were mirrored or none was. So the mirror images are searched if one of the photos
     was ruled out as mirrored by itself, or if no localized photo was sure by itself.
     """
     localized = [k for k, result in results.items() if result.status == LOCALIZED]
@@ -32,9 +32,9 @@ def refuse_mirrored(
     one_is_sure = any(members[k].alone.status == LOCALIZED for k in localized)
     if not localized or (one_is_sure and not one_is_mirrored):
         return {}
-    if not are_mirrored([compare_mirrored(members[k], results[k], means) for k in localized]):
-        return {}
-    return {k: rule_out_mirrored(results[k], min_confidence) for k in localized}
+    differences = {k: compare_mirrored(members[k], results[k], means) for k in localized}
+    mirrored = list_mirrored(differences, one_is_mirrored)
+    return {k: rule_out_mirrored(results[k], min_confidence) for k in mirrored}
 
 
 def compare_mirrored(member: Member, result: Result, means: Means) -> float:
