@@ -10,6 +10,7 @@ from ..geometry.pose import Pose
 from ..judge.candidate import Candidate
 from ..judge.consensus import MOST_CONFLICT, Consensus
 from ..judge.probability import LOCALIZED
+from ..judge.reasons import Reason
 from ..judge.result import Result, nothing_found
 from ..localization.judging import Found, judge
 from ..localization.means import NO_TRACE, Means, Trace
@@ -132,7 +133,8 @@ def find_alone(scan_map: ScanMap, shot: Shot, workers: Workers, watch: Stopwatch
 def expect_focal(panoramas: Sequence[Panorama], alone: Sequence[Result]) -> dict[int, Panorama]:
     """Return the photos that are not sure, by number, with the focal length by those that are.
 
-    The photos are of one camera; the given focal length and the estimates of the sure photos are averaged.
+    The photos are of one camera; the given focal length and the estimates of the sure photos are averaged. A
+    photo that fits better mirrored is left out: another focal length does not turn it over.
     """
     opinions = [one.focal_length.opinion for one in alone if one.status == LOCALIZED and one.focal_length]
     by_sure = Consensus(opinions).opinion(least=1)
@@ -141,7 +143,8 @@ def expect_focal(panoramas: Sequence[Panorama], alone: Sequence[Result]) -> dict
     expected: dict[int, Panorama] = {}
     for k, (panorama, one) in enumerate(zip(panoramas, alone, strict=True)):
         prior = panorama.focal_prior
-        if one.status != LOCALIZED and prior is not None:
+        is_open = one.status != LOCALIZED and Reason.MIRRORED not in one.belief.ruled_out
+        if is_open and prior is not None:
             share = by_sure.share_of_given(prior.deviation)
             focal_px = prior.focal * math.exp((1.0 - share) * by_sure.off)
             expected[k] = panorama.expect_focal(focal_px, prior.deviation * math.sqrt(share))

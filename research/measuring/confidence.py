@@ -290,7 +290,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--claims", "try photos and scans that say something wrong of their own geometry instead")
     text = "try photos and panoramas of places outdoors instead, scanned by stations, a car, stereo pictures"
     option(parser, "--outdoors KIND ...", text, choices=PLACE_KINDS, default=[])
-    option(parser, "--accuracy METRES", "how exact a pose must be", default=PAPER_ACCURACY.metres)
+    option(parser, "--accuracy METRES", "how exact a pose must be", type=float, default=PAPER_ACCURACY.metres)
     option(parser, "--ignore-colors", "localize by the shape of the scans alone")
     option(parser, "--out FILE", "write a JSON line per trial", required=True)
     option(parser, "--threads N", "number of threads", default=num_cores())
