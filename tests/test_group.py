@@ -18,7 +18,7 @@ from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import NO_CANDIDATE
 from piccolo.judge.reasons import MIRRORED, Reason
 from piccolo.judge.result import Result, nothing_found
-from piccolo.judge.selection import list_mirrored
+from piccolo.judge.selection import select_mirrored
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.photo.panorama import Panorama
 from piccolo.system.jobs.threads import Stopwatch, Workers
@@ -253,7 +253,7 @@ def test_a_mirrored_photo_has_less_odds_than_its_mirror_image(is_mirrored):
     problem = rooms.ask(photo, rooms.scan_map(SEED), rooms.KNOWN)
     member = SimpleNamespace(found=SimpleNamespace(problem=problem))
     odds = mirrored.compare_mirrored(member, alone, rooms.means(rooms.KNOWN))
-    assert bool(list_mirrored({0: odds}, False)) == is_mirrored
+    assert bool(select_mirrored({0: odds}, False)) == is_mirrored
 
 
 def test_a_mirror_image_that_is_not_found_tells_nothing(monkeypatch):

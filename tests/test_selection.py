@@ -13,7 +13,7 @@ from piccolo.geometry.pose import step
 from piccolo.judge.candidate import Selection
 from piccolo.judge.probability import Standing
 from piccolo.judge.result import nothing_found
-from piccolo.judge.selection import assess, credit_copies, list_drawn, list_mirrored, select
+from piccolo.judge.selection import assess, credit_copies, list_drawn, select, select_mirrored
 from piccolo.localization import last_descent
 from piccolo.localization.attempts import end_search
 from piccolo.localization.beam import refine_matches
@@ -272,4 +272,4 @@ def test_a_pose_that_explains_less_than_half_of_a_sure_one_is_not_drawn(count, e
     ],
 )
 def test_linked_photos_are_mirrored_as_the_one_that_tells_most(differences, one_is_mirrored, expected):
-    assert list_mirrored(dict(enumerate(differences)), one_is_mirrored) == expected
+    assert select_mirrored(dict(enumerate(differences)), one_is_mirrored) == expected

@@ -35,8 +35,9 @@ from ..problem.stages import Limits
 from ..system.arrays import Array, Mask
 from ..system.jobs.threads import Workers
 from ..views.view import Cells
+from .blocks import take
 from .comparison import mask_occluders
-from .covariance import UNCALIBRATED, compute_acting_range, take
+from .covariance import UNCALIBRATED, compute_acting_range
 from .lens_matches import MOST_LENS_CHANGE, MatchFit, add_matches, fit_matches
 from .scan_errors import displacement_variance
 from .self_calibration import (

@@ -130,7 +130,7 @@ def is_mirrored(method: Method, own: Candidate, mirrored: Candidate | None) -> b
     return (mirrored.num_matches or 0) > (own.num_matches or 0)
 
 
-def list_mirrored(differences: Mapping[int, float], one_is_mirrored: bool) -> list[int]:
+def select_mirrored(differences: Mapping[int, float], one_is_mirrored: bool) -> list[int]:
     """List which of linked photos were mirrored.
 
     `differences` has the log odds of each mirrored photo less those of the photo as it is. The largest

@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 
+from ..evidence.blocks import take
 from ..evidence.comparison import mask_occluders
-from ..evidence.covariance import take
 from ..evidence.examine import examine
 from ..geometry.levenberg_marquardt import retract
 from ..geometry.pose import Pose, orthonormal

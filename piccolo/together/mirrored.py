@@ -12,7 +12,7 @@ from ..judge.conclude import rule_out_mirrored
 from ..judge.probability import LOCALIZED, log_odds
 from ..judge.reasons import Reason
 from ..judge.result import Result
-from ..judge.selection import assess, list_mirrored, rank
+from ..judge.selection import assess, rank, select_mirrored
 from ..localization.attempts import plan_attempts
 from ..localization.means import Means
 from ..localization.run import make_attempts
@@ -33,7 +33,7 @@ def refuse_mirrored(
     if not localized or (one_is_sure and not one_is_mirrored):
         return {}
     differences = {k: compare_mirrored(members[k], results[k], means) for k in localized}
-    mirrored = list_mirrored(differences, one_is_mirrored)
+    mirrored = select_mirrored(differences, one_is_mirrored)
     return {k: rule_out_mirrored(results[k], min_confidence) for k in mirrored}
 
 
