@@ -35,7 +35,6 @@ from ..problem.stages import Limits
 from ..system.arrays import Array, Mask
 from ..system.jobs.threads import Workers
 from ..views.view import Cells
-from .blocks import take
 from .comparison import mask_occluders
 from .covariance import UNCALIBRATED, compute_acting_range
 from .lens_matches import MOST_LENS_CHANGE, MatchFit, add_matches, fit_matches
@@ -60,7 +59,6 @@ OTHERS_WRONG = (0.05, 0.05, 0.05, 0.2)  # chosen: deviations of the other correc
 OTHERS_SHARES = (0.01, 0.01, 0.01, 0.01)  # chosen: shares of wrong claims
 FIRST_CHANGES = (-0.1, 0.1)  # of the focal length's logarithm: further starts of a first fit
 CHANGES_BESIDE = (-0.03, 0.03)  # of the logarithm at an end: starts of further descents, as the loss is rough
-ONE_OF = 4  # points counts where descents from several starts are compared
 NUM_FOCAL_VIEWS = 2  # times that a descent is repeated with the points seen from its end
 FAR_AWAY = 0.5  # [m] from the pose: a descent that ends farther away shows that the photo fixes no pose
 MOST_VARIANCE = 1.0  # of a focal length's logarithm: with more, the picture gives no estimate
@@ -267,9 +265,8 @@ class LensDescents(NamedTuple):
         return descend_freely(points, self.shown.photo.image("full"), freedom, *start, CLOSE)
 
     def find_lowest(self, points: Cells, freedom: Freedom, starts: Sequence[tuple[Pose, Array]]) -> FreeEnd:
-        """Return the lowest end of descents from several starts, on a fraction of the points."""
-        some = take(points, np.arange(0, len(points.weights), ONE_OF))
-        ends = self.workers.map(partial(self.go_on, some, freedom), starts, "fit the focal length")
+        """Return the lowest end of descents on points from several starts."""
+        ends = self.workers.map(partial(self.go_on, points, freedom), starts, "fit the focal length")
         return min(ends, key=lambda end: end.loss)
 
 
@@ -284,9 +281,9 @@ def descend_lens(
     """Descend with the focal length free, then with all corrections of the lens; return both lowest ends.
 
     The descents of the focal length begin with that of the last fit and, in a first fit, with others too. The
-    descents of all corrections begin at the end of the former, and at the fit to the matches. Of several
-    starts only the one with the lowest end goes on with all points. The focal length descends again with the
-    points that are seen from its end: points that are seen from another pose favour that pose.
+    descents of all corrections begin at the end of the former, and at the fit to the matches. The focal
+    length descends again with the points that are seen from its end: points that are seen from another pose
+    favour that pose.
     """
     pose = best.pose
     shown = problem.show(mask_occluders(problem, best.comparison, best.unoccluded).photo)
@@ -308,8 +305,7 @@ def descend_lens(
         near = descents.go_on(descents.find_points(near.pose), of_focal, near.start)
     points = descents.find_points(near.pose)
     starts = [near.start, (by_matches.pose, by_matches.values)]
-    lowest = descents.find_lowest(points, of_all, starts[: 1 + int(by_matches.values.any())])
-    return near, descents.go_on(points, of_all, lowest.start)
+    return near, descents.find_lowest(points, of_all, starts[: 1 + int(by_matches.values.any())])
 
 
 def start_beside(end: FreeEnd) -> list[tuple[Pose, Array]]:
