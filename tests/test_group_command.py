@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from services import serving
 
 from piccolo.api.result_files import read_results
 from piccolo.cli.localize import main
+from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.photo.camera import Mount
 from piccolo.photo.camera.model import pinhole
 from piccolo.photo.panorama.video import choose_distinct
@@ -30,11 +32,15 @@ FOCAL = 0.5 * SIZE[0] / math.tan(math.radians(37.5))
 def folder(tmp_path_factory):
     """Photos that overlap."""
     made = tmp_path_factory.mktemp("a phone")
-    camera = Mount(pinhole(*SIZE, FOCAL))
     for k, (_, pose) in enumerate(taken_photos()):
-        picture = render_picture(camera, rooms.room(SEED)[0].rooms[0], pose, rooms.WORKERS)
-        write(made / f"{k}.png", encoded(picture, ".png"))
+        _take(made / f"{k}.png", pose)
     return made
+
+
+def _take(path, pose):
+    """Write a photo of the room."""
+    camera = Mount(pinhole(*SIZE, FOCAL))
+    write(path, encoded(render_picture(camera, rooms.room(SEED)[0].rooms[0], pose, rooms.WORKERS), ".png"))
 
 
 def untimed_line(text):
@@ -103,18 +109,26 @@ def test_the_service_localizes_photos_together_as_the_command_does(client, panor
 
 @pytest.mark.process
 def test_a_batch_looks_at_photos_that_are_not_sure_together(folder, client, tmp_path, capsys):
-    """None of three is localized alone; the service says the same, and a second run has nothing to do."""
+    """One of three is localized alone; the service says the same, and a second run has nothing to do."""
     out = tmp_path / "poses.jsonl"
-    names = [folder / f"{name}.png" for name in range(3)]
+    _, first = taken_photos()[0]
+    sure = Pose(first.R_cam_from_world @ yaw_rotation(math.radians(30.0)), first.center_world)
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for name in ("0.png", "1.png"):
+        shutil.copy(folder / name, photos)
+    _take(photos / "2.png", sure)
+    names = [photos / f"{name}.png" for name in range(3)]
     words = _command(folder)
     begin = words.index("--pano")
     words[begin + 1 : begin + 2] = list(map(str, names))
     main([*words, "--out", str(out)])
     lines = [untimed_line(line) for line in out.read_text().splitlines()]
     assert [line["status"] for line in lines] == ["localized"] * 3
-    beside = [[name.rpartition("/")[2] for name in line["beside"]["photos"]] for line in lines]
-    assert [sorted(names) for names in beside] == [["1.png", "2.png"], ["0.png", "2.png"], ["0.png", "1.png"]]
-    assert all(line["beside"]["is_together"] for line in lines)
+    assert lines[2]["beside"] is None, "it is localized alone"
+    beside = [[name.rpartition("/")[2] for name in line["beside"]["photos"]] for line in lines[:2]]
+    assert [sorted(names) for names in beside] == [["1.png", "2.png"], ["0.png", "2.png"]]
+    assert all(line["beside"]["is_together"] for line in lines[:2])
     capsys.readouterr()
     before = out.read_bytes()
     main([*words, "--out", str(out)])

@@ -226,13 +226,13 @@ def test_cells_of_no_weight_are_left_out_of_a_part_of_the_sphere_and_change_no_s
     is_hidden = ~(np.abs(np.arange(64) - 20) < 8) & np.ones((32, 1), bool)
     narrow = whole.show(whole.photo.mask(is_hidden))
     cells, blocks = ladder.see_cells(narrow, pose, view)
-    of_all, all_blocks = narrow.view_at(pose, view), VIEWS[view].arrays.blocks
+    of_all = narrow.view_at(pose, view)
+    all_blocks = VIEWS[view].arrays.blocks
     assert (cells.weights > 0.0).all()
     assert len(cells.weights) == len(blocks) == np.count_nonzero(of_all.weights) < 0.4 * len(all_blocks)
     image = narrow.photo.image(view)
-    some, every = (
-        ladder.score_on_cells(*seen, image, pose).score for seen in ((cells, blocks), (of_all, all_blocks))
-    )
+    some = ladder.score_on_cells(cells, blocks, image, pose).score
+    every = ladder.score_on_cells(of_all, all_blocks, image, pose).score
     assert some == pytest.approx(every, rel=1e-6)
     assert len(ladder.see_cells(whole, pose, view)[1]) == len(all_blocks)
 

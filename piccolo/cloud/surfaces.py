@@ -263,6 +263,7 @@ def fit_tensor(normals: Array, variances: Array) -> Array:
         upper = np.linalg.solve(normal_matrix, weighted.T @ variances)
         weights = weigh_absolute(design @ upper - variances, LEAST_RESIDUAL_SQUARED)
         ridge = 1.0 / max(math.sqrt(twice @ upper**2), LEAST_RESIDUAL_SQUARED)
-    tensor[rows, columns] = tensor[columns, rows] = upper
+    tensor[rows, columns] = upper
+    tensor[columns, rows] = upper
     values, axes = np.linalg.eigh(tensor)
     return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)

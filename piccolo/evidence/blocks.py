@@ -28,7 +28,8 @@ def fill_symmetric(upper: Array) -> Array:
     """Return symmetric matrices (..., 6, 6) from their upper triangles (..., 21), row by row."""
     matrix = np.zeros((*upper.shape[:-1], 6, 6))
     rows, columns = np.triu_indices(6)
-    matrix[..., rows, columns] = matrix[..., columns, rows] = upper
+    matrix[..., rows, columns] = upper
+    matrix[..., columns, rows] = upper
     return matrix
 
 

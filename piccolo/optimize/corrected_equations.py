@@ -62,16 +62,18 @@ def write_errors(
     p = points
     total = F0
     loaded = F0
-    c0, c1, c2 = channels[0], channels[1], channels[2]
     for i in range(len(weights)):
-        t00, t10, t01, t11 = p.t00[i], p.t10[i], p.t01[i], p.t11[i]
+        t00 = p.t00[i]
+        t10 = p.t10[i]
+        t01 = p.t01[i]
+        t11 = p.t11[i]
         weight = weights[i] * is_valid(t00, t10, t01, t11)
         e0, u0, v0 = blend_with_gradient(t00, t10, t01, t11, p.fu[i], p.fv[i], 0)
         e1, u1, v1 = blend_with_gradient(t00, t10, t01, t11, p.fu[i], p.fv[i], 8)
         e2, u2, v2 = blend_with_gradient(t00, t10, t01, t11, p.fu[i], p.fv[i], 16)
-        e0 -= c0[i]
-        e1 -= c1[i]
-        e2 -= c2[i]
+        e0 -= channels[0, i]
+        e1 -= channels[1, i]
+        e2 -= channels[2, i]
         cost, w = inline_geman_mcclure(e0 * e0 + e1 * e1 + e2 * e2, inverse_scale2)
         total += weight * cost
         loaded += weight
@@ -111,10 +113,10 @@ def write_derivatives(points: Projected, moves: Array32, width: Scalar, rows: Ro
     for j in range(len(moves)):
         of_u = u[NUM_OF_POSE + j]
         of_v = v[NUM_OF_POSE + j]
-        mx, my, mz = moves[j, 0], moves[j, 1], moves[j, 2]
+        move = moves[j]
         for i in range(count):
-            of_u[i] = -u[3, i] * mx[i] - u[4, i] * my[i]
-            of_v[i] = -v[3, i] * mx[i] - v[4, i] * my[i] - v[5, i] * mz[i]
+            of_u[i] = -u[3, i] * move[0, i] - u[4, i] * move[1, i]
+            of_v[i] = -v[3, i] * move[0, i] - v[4, i] * move[1, i] - v[5, i] * move[2, i]
 
 
 @inline_kernel

@@ -144,8 +144,8 @@ def render_view(points: PackedPoints, pose: Pose, width: int) -> View:
     """
     depth = nearest_depth(points, pose, width)
     sums = np.zeros((depth.size, 4))
-    R, center = pose.R_cam_from_world, pose.center_world
-    mean_colors(_xyz(points), points.rgbx, R, center, width, depth.reshape(-1), sums)
+    nearest = depth.reshape(-1)
+    mean_colors(_xyz(points), points.rgbx, pose.R_cam_from_world, pose.center_world, width, nearest, sums)
     rgb = (sums[:, :3] / np.maximum(sums[:, 3:], 1.0) / 255.0).astype(np.float32)
     return View(depth, rgb.reshape(width // 2, width, 3))
 

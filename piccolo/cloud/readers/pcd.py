@@ -18,7 +18,8 @@ from . import reader
 from .reader import MissingChannelError, PointSource, quote_line
 from .text import LineLayout, NumberLines
 
-MAX_PCD_HEADER_SIZE = MAX_PCD_ROW = 1 << 16  # [byte] a row is one point
+MAX_PCD_HEADER_SIZE = 1 << 16  # [byte]
+MAX_PCD_ROW = 1 << 16  # [byte] a row is one point
 MAX_PCD_COUNT_DIGITS = 10
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 WANTED = "wanted a PCD file with the fields x y z and rgb, rgba or r g b"
