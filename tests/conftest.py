@@ -1,6 +1,5 @@
 """Every result that a test makes, or that a command writes for it, is checked (consistency.py)."""
 
-import math
 import os
 import signal
 import threading
@@ -13,7 +12,6 @@ from consistency import contradictions_of_line, find_contradictions, lines_of_re
 
 from piccolo.cloud.readers import e57, las, mesh, reader, text
 from piccolo.judge.result import Result
-from piccolo.localization import claimed_geometry
 from piccolo.system.files import cache
 from piccolo.system.jobs.memory import limit_memory
 from piccolo.system.kernels import jit
@@ -148,12 +146,6 @@ def coarse_colors():
             for name, value in COARSE[module.__name__.rpartition(".")[2]].items():
                 patch.setattr(module, name, value)
         yield
-
-
-@pytest.fixture
-def as_claimed(monkeypatch):
-    """Panoramas show what they claim: to search what else takes seconds, of one that is found nowhere."""
-    monkeypatch.setattr(claimed_geometry, "SUSPECT", math.inf)
 
 
 @pytest.fixture(scope="session")

@@ -22,18 +22,17 @@ def _share(patch, owner, name, key):
     patch.setattr(owner, name, ask)
 
 
-def search_alone_once(patch, by_threads):
-    """Share what photos find by themselves; for each number of threads if `by_threads`, else for all."""
+def search_alone_once(patch):
+    """Share what photos find by themselves, for each number of threads."""
 
     def alone(scan_map, shot, workers, _):
-        threads = workers.num_threads if by_threads else None
-        return id(scan_map), _content(shot.panorama), shot.settings, threads
+        return id(scan_map), _content(shot.panorama), shot.settings, workers.num_threads
 
     def mirror(member, result, means):
         problem = member.found.problem
-        threads = means.workers.num_threads if by_threads else None
         pose = result.best_pose and result.best_pose.key
-        return id(problem.scan_map), _content(problem.photo.panorama), pose, result.confidence, threads
+        known = _content(problem.photo.panorama), pose, result.confidence
+        return id(problem.scan_map), *known, means.workers.num_threads
 
     _share(patch, members, "find_alone", alone)
     _share(patch, mirrored, "compare_mirrored", mirror)

@@ -71,7 +71,7 @@ def test_a_clear_photo_needs_no_features_and_the_result_says_so():
 
 
 @pytest.mark.parametrize("how", ["mirrored", "gravity unknown", "part of a sphere"])
-def test_features_are_asked_of_what_is_not_clear(how, as_claimed):
+def test_features_are_asked_of_what_is_not_clear(how):
     panorama = rooms.as_panorama(rooms.query(1).rgb)
     settings = rooms.KNOWN
     if how == "mirrored":

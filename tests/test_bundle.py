@@ -47,7 +47,7 @@ WHERE = (4, 1, 7)  # eighths of a turn; the first alone is not sure
 @pytest.fixture(autouse=True, scope="module")
 def _searched_once():
     with pytest.MonkeyPatch.context() as patch:
-        search_alone_once(patch, by_threads=True)
+        search_alone_once(patch)
         yield
 
 

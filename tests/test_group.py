@@ -35,9 +35,8 @@ SUPPORT = Support(NO_CANDIDATE, None, is_found=True, odds=1.0, odds_elsewhere=0.
 
 @pytest.fixture(autouse=True, scope="module")
 def _searched_once():
-    """Bundles compare searches by several numbers of threads."""
     with pytest.MonkeyPatch.context() as patch:
-        search_alone_once(patch, by_threads=False)
+        search_alone_once(patch)
         yield
 
 
