@@ -89,6 +89,6 @@ def test_limitations_are_those_of_the_benchmark():
     assert _benchmark_rows("60% hidden by objects")[::2] == [12, 10, 0], "a sixth is not found"
     assert _benchmark_rows("masked outside of 65 deg")[::2] == [12, 9, 0], "a quarter is not found"
     queries, _, localized, _, _ = _benchmark_rows(r"h\w+, (?:exact focal length|focal length by EXIF)")
-    assert round(1 - localized / queries, 1) == 0.4, "four of ten are not found"
+    assert round(1 - localized / queries, 1) == 0.3, "three of ten are not found"
     assert _benchmark_rows(r"h\w+, photo")[::4] == [12, 4]
     assert _benchmark_rows("corridor, own photos")[2::2] == [5, 4]
