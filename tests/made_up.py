@@ -5,11 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from piccolo.evidence.verification import round_pose
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.geometry.sphere import CHANCE_CORRELATION
 from piccolo.judge.alternatives import Hypothesis
-from piccolo.judge.candidate import Candidate, Comparison, Selection
-from piccolo.local_features.matching import Matches
+from piccolo.judge.candidate import Candidate, Comparison, Drawn, Selection
+from piccolo.local_features.keypoints import join_keypoints
+from piccolo.local_features.matching import Located, Matches
 from piccolo.photo.photo import NOTHING_KNOWN
 from piccolo.problem.problem import Problem
 from piccolo.problem.profile import PROFILES
@@ -65,6 +67,12 @@ def seen(explains, num_blocks=4):
     beyond = CHANCE_CORRELATION + (1.0 - CHANCE_CORRELATION) * explains
     area = np.full(num_blocks, 0.01)
     return Comparison(np.full(num_blocks, beyond), area, area, 0.01 * num_blocks)
+
+
+def drawn_at(pose, matches):
+    """What was drawn at a pose, a picture of which nothing is asked, with the matches of a photo."""
+    key, on_grid = round_pose(pose)
+    return Drawn(key, Located(join_keypoints([]), np.empty(0, np.float32), on_grid), matches)
 
 
 def exact_matches(pose, count, num_wrong=0, seed=0):

@@ -12,6 +12,7 @@ from made_up import (
     PROBLEM,
     WHOLE,
     WHOLE_SHAPE,
+    drawn_at,
     exact_matches,
     make_candidate,
     make_selection,
@@ -19,10 +20,8 @@ from made_up import (
 )
 
 from piccolo.evidence.examine import examine
-from piccolo.evidence.verification import round_pose
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import Pose, exp_so3, step
-from piccolo.judge.candidate import Drawn
 from piccolo.judge.probability import LOCALIZED
 from piccolo.judge.selection import is_clear
 from piccolo.local_features.matching import NO_MATCHES
@@ -290,7 +289,7 @@ def test_poses_of_a_part_of_the_sphere_are_verified(is_partial):
     for k in range(10):
         candidate = make_candidate(float(k), 0.9 - 0.05 * k)
         moved = Pose(candidate.pose.R_cam_from_world, candidate.pose.center_world + np.array([0.1, 0.0, 0.0]))
-        drawn = Drawn(round_pose(candidate.pose)[0], exact_matches(moved, num_matches.get(k, 0)))
+        drawn = drawn_at(candidate.pose, exact_matches(moved, num_matches.get(k, 0)))
         known.append(replace(candidate, drawn=drawn))
     found = attempts.add_verified(problem, known, Workers(1))
     assert all(one.pose is before.pose for one, before in zip(found, known, strict=False))

@@ -9,7 +9,7 @@ import narrow_photo
 import numpy as np
 import pytest
 import rooms
-from made_up import exact_matches, make_candidate, make_selection
+from made_up import drawn_at, exact_matches, make_candidate, make_selection
 from rooms import WORKERS
 
 from piccolo.cloud.stream import CloudPoints
@@ -22,7 +22,6 @@ from piccolo.geometry.nearness import ROOM_RANGE
 from piccolo.geometry.pose import MAX_DISTANCE, Pose, exp_so3, log_so3, step, yaw_rotation
 from piccolo.geometry.pose_gaussian import LIKELY, subtract
 from piccolo.geometry.sphere import compute_indices
-from piccolo.judge.candidate import Drawn
 from piccolo.local_features import matching
 from piccolo.local_features.hypotheses import count_inliers
 from piccolo.local_features.matching import NO_MATCHES
@@ -120,16 +119,23 @@ def _beside_its_twin():
     return rooms.ask(narrow_photo.take()[0], prepare_map(rooms.stream(both), Workers(2)), rooms.UNKNOWN)
 
 
-def test_copies_of_a_place_are_where_the_drawn_scan_looks_the_same():
-    """Not elsewhere in the twin, nor near in the room."""
+def test_copies_of_a_place_are_where_the_drawn_scan_looks_the_same(monkeypatch):
+    """Not elsewhere in the twin, nor near in the room; what is drawn already is not drawn again."""
     problem = _beside_its_twin()
     here = problem.scan_map.from_world(narrow_photo.take()[1])
     moves = [(6.05, 0.0, 0.02), (6.9, -0.8, 0.0), (0.9, -0.8, 0.0)]
     others = [Pose(here.R_cam_from_world, here.center_world + move) for move in moves]
     away = Pose(yaw_rotation(2.0) @ here.R_cam_from_world, here.center_world + APART)
-    found = verification.find_copies(problem, here, [*others, away], WORKERS)
+    one, *rivals = (replace(make_candidate(0.0, 0.5), pose=pose) for pose in (here, *others, away))
+    found = verification.find_copies(problem, one, rivals, WORKERS)
     assert found == [True, False, False, False]
-    assert verification.find_copies(problem, here, [], WORKERS) == []
+    assert verification.find_copies(problem, one, [], WORKERS) == []
+    drawn = [
+        replace(each, drawn=verification.draw_near(problem, each.pose, None, WORKERS))
+        for each in (one, *rivals)
+    ]
+    monkeypatch.setattr(verification, "find_all_drawn", None)
+    assert verification.find_copies(problem, drawn[0], drawn[1:], WORKERS) == found
 
 
 def test_copies_are_looked_for_among_poses_that_could_win():
@@ -277,25 +283,34 @@ def test_the_scan_is_drawn_once_for_each_pose_of_the_grid():
         exp_so3(verification.TURN * np.array([3.0, -2.0, 8.0])),
         verification.PLACE * np.array([7.0, -4.0, 2.0]),
     )
-    known = Drawn(verification.round_pose(middle)[0], NO_MATCHES)
+    known = drawn_at(middle, NO_MATCHES)
     for share in (0.0, 0.4, -0.4):
         turn = log_so3(middle.R_cam_from_world) + share * verification.TURN
         near = Pose(exp_so3(turn), middle.center_world + share * verification.PLACE)
-        drawn_at = verification.round_pose(near)[1]
-        np.testing.assert_allclose(drawn_at.center_world, middle.center_world, atol=1e-12)
-        np.testing.assert_allclose(drawn_at.R_cam_from_world, middle.R_cam_from_world, atol=1e-9)
+        on_grid = verification.round_pose(near)[1]
+        np.testing.assert_allclose(on_grid.center_world, middle.center_world, atol=1e-12)
+        np.testing.assert_allclose(on_grid.R_cam_from_world, middle.R_cam_from_world, atol=1e-9)
         assert verification.draw_near(narrow_photo.problem(), near, known, WORKERS) is known
     beside = Pose(middle.R_cam_from_world, middle.center_world + 0.6 * verification.PLACE)
     turned = exp_so3(log_so3(middle.R_cam_from_world) + np.array([0.0, 0.6 * verification.TURN, 0.0]))
     for other in (beside, Pose(turned, middle.center_world)):
         drawn = verification.draw_near(narrow_photo.problem(), other, known, WORKERS)
-        key, drawn_at = verification.round_pose(other)
+        key, on_grid = verification.round_pose(other)
         assert drawn.key == key != known.key
-        picture = verification.find_all_drawn(narrow_photo.problem(), drawn_at, WORKERS)
+        picture = verification.find_all_drawn(narrow_photo.problem(), on_grid, WORKERS)
         expected = verification.match_located(
             narrow_photo.problem().photo.features(WORKERS).keypoints, picture
         )
         np.testing.assert_array_equal(drawn.matches.points, expected.points)
+
+
+def test_for_a_photo_without_features_nothing_is_drawn(monkeypatch):
+    panorama = narrow_photo.take()[0]
+    blank = replace(panorama, rgb=np.full_like(panorama.rgb, 128))
+    monkeypatch.setattr(verification, "find_all_drawn", None)
+    problem = narrow_photo.problem().retake(blank)
+    drawn = verification.draw_near(problem, narrow_photo.true_pose(), None, WORKERS)
+    assert len(drawn.matches.points) == len(drawn.picture.ranges) == 0
 
 
 def test_matches_lie_on_the_scan_where_the_photo_sees_them():
@@ -328,7 +343,7 @@ def test_matches_lie_on_the_scan_where_the_photo_sees_them():
 def test_matches_with_which_a_pose_moves_away_are_anothers(offset, yaw_deg, expected):
     """By 0.3 m or 5 degrees."""
     moved = _moved(offset, math.radians(yaw_deg))
-    drawn = Drawn(verification.round_pose(narrow_photo.true_pose())[0], exact_matches(moved, 30))
+    drawn = drawn_at(narrow_photo.true_pose(), exact_matches(moved, 30))
     candidate = replace(examine(narrow_photo.problem(), narrow_photo.true_pose()), drawn=drawn)
     assert count_agreeing(narrow_photo.problem(), candidate, WORKERS).num_matches == expected
 

@@ -16,7 +16,7 @@ from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
 from ..geometry.pose_gaussian import LOOSE, differentiate_rays
 from ..geometry.sphere import compute_indices
-from ..judge.candidate import Drawn
+from ..judge.candidate import Candidate, Drawn
 from ..local_features.hypotheses import COS_EXACT, LEAST_MATCHES, count_inliers, exact_pose, find_inliers
 from ..local_features.keypoints import Keypoints, find_in_view, join_keypoints
 from ..local_features.matching import (
@@ -97,13 +97,17 @@ def match_covariance(matches: Matches, pose: Pose) -> Array:
 def draw_near(problem: Problem, pose: Pose, known: Drawn | None, workers: Workers) -> Drawn:
     """Match the photo's features with the scan drawn near a pose, on a grid of poses.
 
-    `known` are the matches near another pose: they are returned if both poses have the same pose of the grid.
+    `known` was drawn near another pose: it is returned if both poses have the same pose of the grid. For a
+    photo without features nothing is drawn.
     """
     key, drawn_at = round_pose(pose)
     if known is not None and known.key == key:
         return known
+    keypoints = problem.photo.features(workers).keypoints
+    if len(keypoints.rays) == 0:
+        return Drawn(key, Located(keypoints, keypoints.sizes, drawn_at), NO_MATCHES)
     picture = find_all_drawn(problem, drawn_at, workers)
-    return Drawn(key, match_located(problem.photo.features(workers).keypoints, picture))
+    return Drawn(key, picture, match_located(keypoints, picture))
 
 
 def round_pose(pose: Pose) -> tuple[bytes, Pose]:
@@ -121,18 +125,23 @@ def find_all_drawn(problem: Problem, pose: Pose, workers: Workers) -> Located:
     return Located(join_keypoints([keypoints for keypoints, _ in parts]), ranges, pose)
 
 
-def find_copies(problem: Problem, pose: Pose, others: Sequence[Pose], workers: Workers) -> list[bool]:
-    """Return True for each of the other poses at which the scan looks as it does at a pose.
+def find_copies(
+    problem: Problem, one: Candidate, others: Sequence[Candidate], workers: Workers
+) -> list[bool]:
+    """Return True for each of the other candidates at which the scan looks as it does at one of them.
 
-    Rooms of one kind look so. The scan drawn at the one pose is matched with the scan drawn at the other.
+    Rooms of one kind look so. The scan drawn near the one pose is matched with the scan drawn near the other.
     """
     if not others:
         return []
-    keypoints = find_all_drawn(problem, pose, workers).keypoints
+    drawn = draw_near(problem, one.pose, one.drawn, workers).picture
+    drawn_from_one = drawn.pose @ one.pose.inverse()
 
-    def is_copy(other: Pose) -> bool:
-        found = exact_pose(match_located(keypoints, find_all_drawn(problem, other, workers)), other)
-        return found is not None and CONFIRMED.holds(found.pose, other)
+    def is_copy(other: Candidate) -> bool:
+        picture = draw_near(problem, other.pose, other.drawn, workers).picture
+        expected = drawn_from_one @ other.pose
+        found = exact_pose(match_located(drawn.keypoints, picture), expected)
+        return found is not None and CONFIRMED.holds(found.pose, expected)
 
     return workers.map(is_copy, others, "compare places")
 

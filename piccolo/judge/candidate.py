@@ -8,7 +8,7 @@ import numpy as np
 
 from ..geometry.pose import Pose
 from ..geometry.sphere import CHANCE_CORRELATION, NUM_BLOCKS
-from ..local_features.matching import Matches
+from ..local_features.matching import Located, Matches
 from ..problem.photo_images import PhotoImages
 from ..system.arrays import Array, Mask
 from .reasons import Contradiction
@@ -62,9 +62,10 @@ class Unoccluded(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """The matches of a photo with the scan drawn near a pose, on a grid of poses."""
+    """The scan drawn near a pose, on a grid of poses, and the matches of a photo with it."""
 
     key: bytes  # of the pose of the grid
+    picture: Located  # at that pose; without keypoints if the photo has none
     matches: Matches
 
 

@@ -16,10 +16,10 @@ from ..evidence.claimed_sphere import (
     make_freedom,
     search_geometry,
 )
-from ..evidence.examine import examine_each
+from ..evidence.examine import examine, examine_each
 from ..evidence.focal_length import FOCAL_WIDTHS, FocalFit, fit_focal, list_matches
 from ..evidence.lens_matches import fit_matches
-from ..evidence.self_calibration import descend_freely, estimate_corrections
+from ..evidence.self_calibration import FreeEnd, descend_freely, estimate_corrections
 from ..geometry.pose import Pose, rotate_points
 from ..geometry.pose_gaussian import add
 from ..judge.candidate import Selection
@@ -31,6 +31,7 @@ from ..problem.problem import Problem
 from ..problem.stages import Limits
 from ..system.arrays import Array, Array32
 from ..system.jobs.threads import Workers
+from .ladder import climb_unoccluded, settle
 from .last_descent import refine_best
 
 MIN_CALIBRATED_SCORE_LEFT = 0.95  # fraction of the score that a pose must keep with another focal length
@@ -147,30 +148,35 @@ def retake_as_found(
     """Search other geometries; return problem and poses with one that explains clearly more, else None.
 
     A geometry that explains less than the claimed one is not refined. One that still changes after all rounds
-    is not known.
+    is not known. The other poses are refined with the geometry found, not in each round.
     """
     end = search_geometry(problem, found.best.pose, claimed, workers)
     if count_deviations(estimate_corrections(end, SPHERE_CURVATURE)) < CONTRADICTED_DEVIATIONS:
         return None
-    given = problem.given
     camera = claimed
-    best = found
     for _ in range(MOST_ROUNDS):
         camera = Corrections(Mount(camera)).apply(end.values)
-        problem = problem.retake(given.retake(camera))
-        others = [h.pose for h in best.alternatives]
-        scored = examine_each(problem, [end.pose, *others], workers)
-        if scored[0].score < found.best.score:
+        retaken = problem.retake(problem.given.retake(camera))
+        start = examine(retaken, end.pose)
+        if start.score < found.best.score:
             return None
-        best = refine_best(problem, scored, workers)
-        pose = best.best.pose
-        points = problem.view_at(pose, "points")
-        full = problem.photo.image("full")
-        end = descend_freely(points, full, make_freedom(camera), pose, NO_CORRECTION, FULL_LIMITS)
+        best = settle(retaken, climb_unoccluded(retaken, start, workers), workers)
+        end = descend_on_points(retaken, best.pose, camera)
         if np.all(np.abs(end.values) < CLAIM.deviations):
             break
     else:
         return None
-    if best.best.score < MIN_RETAKE_GAIN * found.best.score:
+    if best.score < MIN_RETAKE_GAIN * found.best.score:
         return None
-    return problem, best, SphereFit(camera, estimate_corrections(end, SPHERE_CURVATURE), is_claimed=False)
+    others = examine_each(retaken, [h.pose for h in found.alternatives], workers)
+    refined = refine_best(retaken, [best, *others], workers)
+    end = descend_on_points(retaken, refined.best.pose, camera)
+    fit = SphereFit(camera, estimate_corrections(end, SPHERE_CURVATURE), is_claimed=False)
+    return retaken, refined, fit
+
+
+def descend_on_points(problem: Problem, pose: Pose, camera: Camera) -> FreeEnd:
+    """Descend from a pose with the corrections of a panorama's geometry free, on single points."""
+    points = problem.view_at(pose, "points")
+    full = problem.photo.image("full")
+    return descend_freely(points, full, make_freedom(camera), pose, NO_CORRECTION, FULL_LIMITS)

@@ -45,6 +45,6 @@ def list_copies(problem: Problem, ranked: Sequence[Candidate], one: int, workers
         return [False] * len(ranked)
     is_rival = list_drawn(problem.profile, ranked)
     others = [k for k in range(len(ranked)) if k != one and is_rival[k]]
-    found = find_copies(problem, ranked[one].pose, [ranked[k].pose for k in others], workers)
+    found = find_copies(problem, ranked[one], [ranked[k] for k in others], workers)
     copies = {k for k, is_copy in zip(others, found, strict=True) if is_copy}
     return [k == one or k in copies for k in range(len(ranked))]

@@ -65,9 +65,10 @@ class Storeys(NamedTuple):
         storey = np.full(len(centers), -1)
         height = np.full(len(centers), np.nan)
         is_sure = np.zeros(len(centers), np.bool_)
-        for k, one in enumerate(self.storeys):
+        for k, one in enumerate(self.storeys if len(centers) else ()):
             found = [one.nearest(center, NUM_NEAREST) for center in centers]
-            above = centers[:, 2] - [np.percentile(heights, LOW) for _, heights in found]
+            heights = np.array([around for _, around in found])
+            above = centers[:, 2] - np.percentile(heights, LOW, axis=1)
             is_near = np.array([distance[0] < MOST_BESIDE_FLOOR for distance, _ in found], np.bool_)
             is_better = (above > 0.0) & (is_near | ~is_sure) | (storey < 0)
             storey[is_better] = k
