@@ -144,29 +144,29 @@ def test_a_batch_looks_at_photos_that_are_not_sure_together(folder, client, tmp_
 
 
 def test_a_film_of_one_place_is_its_frames_together(folder, tmp_path, capsys):
-    """A camera shows each of two views for half a second."""
+    """A camera shows each of three views for half a second."""
     film = tmp_path / "film.mp4"
     out = tmp_path / "poses.jsonl"
     trace = tmp_path / "trace.jsonl"
     with writing_video(film, 2.0, SIZE) as add:
-        for k in range(2):
+        for k in range(3):
             add(cv2.imread(str(folder / f"{k}.png"))[..., ::-1])
     words = _command(folder, "--together", "--overwrite", "--out", out)
     begin = words.index("--pano")
     words[begin : begin + 2] = ["--video", str(film)]
     main([*words, "--trace", str(trace)])
     results = read_results([out])
-    frames = [f"{film}#t={time}" for time in ("0.000", "0.500")]
+    frames = [f"{film}#t={time}" for time in ("0.000", "0.500", "1.000")]
     assert [one.pano for one in results] == frames
-    assert [one.status for one in results] == ["localized"] * 2
+    assert [one.status for one in results] == ["localized"] * 3
     for one in results:
         assert list(one.beside.photos) == [name for name in frames if name != one.pano]
         assert one.settings["together"]
     steps = [json.loads(line) for line in trace.read_text().splitlines()]
     assert {step["pano"] for step in steps} == set(frames)
     said = capsys.readouterr().err
-    assert "2 photos together in" in said
-    assert "2 of them by others too" in said
+    assert "3 photos together in" in said
+    assert "3 of them by others too" in said
     assert main([*words, "--max-speed", "2"]) == 2
     assert "--max-speed: not with --together: its photos are in no order" in capsys.readouterr().err
 
