@@ -1,12 +1,15 @@
 """Photos of other cameras than spheres, from the file to the pose."""
 
 import json
+import os
+import subprocess
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import rooms
+from batches import command_of
 from camera_room import SEED, place, scan
 from cameras import four_sides
 from pictures import encoded, write
@@ -29,6 +32,7 @@ TIER = "scene"
 
 BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 FISHEYE = Camera("OPENCV_FISHEYE", 256, 256, (75.0, 75.0, 128.0, 128.0, 0.01, -0.003, 0.0, 0.0), 95.0)
+PHONE = pinhole(320, 240, 260.0)
 DUAL = (Mount(FISHEYE), Mount(FISHEYE, BACK, offset=(256, 0)))
 
 
@@ -87,6 +91,23 @@ def test_a_tilted_wide_photo_is_found_by_its_gravity(tmp_path):
     rooms.assert_near(result.best_pose, pose, 0.02, 0.5)
     (mount,) = result.cameras
     assert mount.camera.params == pytest.approx(camera.params, rel=0.01)  # its focal length is fitted
+
+
+@pytest.mark.process
+def test_another_blas_changes_no_pose(tmp_path):
+    """OpenBLAS multiplies matrices otherwise for processors without AVX."""
+    this, pose = place()
+    photo = write(tmp_path / "a.png", encoded(render_picture(Mount(PHONE), this, pose, Workers(2)), ".png"))
+    words = ["--cloud", rooms.map_path(SEED), "--pano", photo, "--focal", PHONE.focal[0], "--quiet"]
+    found = []
+    for core in ("Haswell", "Prescott"):
+        surroundings = {**os.environ, "OPENBLAS_CORETYPE": core}
+        run = subprocess.run(
+            command_of("localize.py", *words), env=surroundings, capture_output=True, text=True, check=False
+        )
+        found.append(Result.from_json(run.stdout).best_pose)
+    np.testing.assert_allclose(found[0].center_world, found[1].center_world, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(found[0].R_cam_from_world, found[1].R_cam_from_world, rtol=0, atol=1e-7)
 
 
 def test_spheres_masks_of_each_picture_of_a_rig_count_together(tmp_path):

@@ -52,6 +52,16 @@ def test_conventions_of_turns_steps_quaternions_and_matrices():
     np.testing.assert_allclose(forward, [np.cos(yaw), np.sin(yaw), 0.0], atol=1e-12)
 
 
+def test_products_are_sums_in_order_on_all_processors():
+    """No product is added before it is rounded, as BLAS does on some."""
+    rng = np.random.default_rng(3)
+    one, other = rng.normal(size=(2, 4, 3, 3))
+    for a, b, product in zip(one, other, poses.multiply(one, other), strict=True):
+        expected = [[x * b[0, k] + y * b[1, k] + z * b[2, k] for k in range(3)] for x, y, z in a]
+        np.testing.assert_array_equal(product, expected)
+        np.testing.assert_array_equal(poses.rotate_vector(a, b[:, 1]), product[:, 1])
+
+
 @pytest.mark.parametrize("w", VECTORS)
 def test_left_jacobian_against_central_differences(w):
     for axis in range(3):

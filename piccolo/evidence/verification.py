@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from ..geometry.nearness import CONFIRMED
-from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
+from ..geometry.pose import Pose, exp_so3, log_so3, multiply, rotate_points
 from ..geometry.pose_gaussian import LOOSE, differentiate_rays
 from ..geometry.sphere import compute_indices
 from ..judge.candidate import Candidate, Drawn
@@ -188,7 +188,7 @@ def draw(problem: Problem, pose: Pose, view: PerspectiveView) -> tuple[ViewImage
     """Draw the scan as a view of a photo would show it at a pose, a little larger; return also its mask."""
     mask = view.cut_mask(add_margin(problem.photo.panorama.is_valid))
     shown = cv2.dilate(mask, np.ones((2 * DRAWN_AROUND + 1,) * 2, np.uint8))
-    turned = Pose(view.R_sphere_from_view.T @ pose.R_cam_from_world, pose.center_world)
+    turned = Pose(multiply(view.R_sphere_from_view.T, pose.R_cam_from_world), pose.center_world)
     return render_gray(problem.scan_map.octree, turned, shown > 0, view.focal), np.asarray(shown, np.uint8)
 
 

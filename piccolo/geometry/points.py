@@ -7,7 +7,7 @@ import numpy as np
 from ..system.arrays import Array, Array32, Bytes, Int32s, Integers
 from ..system.errors import InputError
 from .colors import pack_rgbx
-from .pose import Pose
+from .pose import Pose, multiply, rotate_vector
 
 FARTHEST_POINT = 1e7  # [m] from the local origin; squares stay finite in float32 and the loss is inf beyond
 
@@ -53,12 +53,14 @@ class MapFrame:
             found = f"found a camera at {center_world.tolist()}"
             raise InputError(f"{found}, wanted one within {FARTHEST_POINT:.0e} m of the cloud")
         R = self.R_map_from_world
-        return Pose(pose.R_cam_from_world @ R.T, R @ (center_world - self.origin_world))
+        center_map = rotate_vector(R, center_world - self.origin_world)
+        return Pose(multiply(pose.R_cam_from_world, R.T), center_map)
 
     def to_world(self, pose: Pose) -> Pose:
         """Transform a pose of this frame to the world."""
         R = self.R_map_from_world
-        return Pose(pose.R_cam_from_world @ R, R.T @ pose.center_world + self.origin_world)
+        center_world = rotate_vector(R.T, pose.center_world) + self.origin_world
+        return Pose(multiply(pose.R_cam_from_world, R), center_world)
 
 
 @dataclass(frozen=True)

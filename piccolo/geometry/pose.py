@@ -100,12 +100,22 @@ class Pose(ByValue):
 
     def inverse(self) -> "Pose":
         """Return the inverse transform, which takes camera coordinates to the world's."""
-        return Pose(self.R_cam_from_world.T, -self.R_cam_from_world @ self.center_world)
+        return Pose(self.R_cam_from_world.T, -rotate_vector(self.R_cam_from_world, self.center_world))
 
     def __matmul__(self, other: "Pose") -> "Pose":
         """Compose two transforms, of which `other` is applied first: `c_from_w = c_from_b @ b_from_w`."""
-        center_world = other.center_world + other.R_cam_from_world.T @ self.center_world
-        return Pose(self.R_cam_from_world @ other.R_cam_from_world, center_world)
+        center_world = other.center_world + rotate_vector(other.R_cam_from_world.T, self.center_world)
+        return Pose(multiply(self.R_cam_from_world, other.R_cam_from_world), center_world)
+
+
+def multiply(one: Array, other: Array) -> Array:
+    """Return the product of matrices (..., 3, 3), to the same bits on all processors; BLAS sums otherwise."""
+    return np.asarray(np.einsum("...ij,...jk->...ik", one, other))
+
+
+def rotate_vector(R_target_from_source: Array, vector: Array) -> Array:
+    """Return a vector (3,) rotated by a matrix (3, 3), to the same bits on all processors."""
+    return np.asarray(np.einsum("ij,j->i", R_target_from_source, vector))
 
 
 def skew(w: Array) -> Array:
@@ -115,29 +125,29 @@ def skew(w: Array) -> Array:
 
 def exp_so3(w: Array) -> Array:
     """Return the rotation matrix (3, 3) of a rotation vector `w` (3,) [rad] (Rodrigues)."""
-    angle = float(np.linalg.norm(w))
+    angle = math.hypot(*w)
     K = skew(np.asarray(w, dtype=np.float64))
     # np.sinc(x) is sin(pi x) / (pi x): exact at angle 0
     a = np.sinc(angle / np.pi)
     b = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
-    return np.asarray(np.eye(3) + a * K + b * (K @ K))
+    return np.asarray(np.eye(3) + a * K + b * multiply(K, K))
 
 
 def log_so3(R: Array) -> Array:
     """Return the rotation vector (3,) [rad], of length [0, pi], of a rotation (3, 3): `exp_so3` inverted."""
     w, *v = quaternion_wxyz(R)
-    sine = float(np.linalg.norm(v))
+    sine = math.hypot(*v)
     scale = 2.0 * float(np.arctan2(sine, w)) / sine if sine > 0.0 else 2.0
     return scale * np.array(v)
 
 
 def left_jacobian(w: Array) -> Array:
     """Return the J (3, 3) with exp([w + dw]x) = exp([J dw]x) exp([w]x) to first order in `dw`."""
-    angle = float(np.linalg.norm(w))
+    angle = math.hypot(*w)
     K = skew(np.asarray(w, dtype=np.float64))
     a = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
     b = 1.0 / 6.0 if angle < 1e-4 else (angle - np.sin(angle)) / angle**3
-    return np.asarray(np.eye(3) + a * K + b * (K @ K))
+    return np.asarray(np.eye(3) + a * K + b * multiply(K, K))
 
 
 def step(pose: Pose, delta: Array) -> Pose:
@@ -145,14 +155,15 @@ def step(pose: Pose, delta: Array) -> Pose:
 
     R <- exp([w]x) R, center <- center + R^T d, with R before the rotation.
     """
-    center_world = pose.center_world + pose.R_cam_from_world.T @ delta[3:]
-    return Pose(orthonormal(exp_so3(delta[:3]) @ pose.R_cam_from_world), center_world)
+    center_world = pose.center_world + rotate_vector(pose.R_cam_from_world.T, delta[3:])
+    return Pose(orthonormal(multiply(exp_so3(delta[:3]), pose.R_cam_from_world)), center_world)
 
 
 def step_between(pose: Pose, other: Pose) -> Array:
     """Return the `delta` (6,) by which `step` moves a pose to another."""
-    turn = log_so3(other.R_cam_from_world @ pose.R_cam_from_world.T)
-    return np.concatenate([turn, pose.R_cam_from_world @ (other.center_world - pose.center_world)])
+    turn = log_so3(multiply(other.R_cam_from_world, pose.R_cam_from_world.T))
+    offset = other.center_world - pose.center_world
+    return np.concatenate([turn, rotate_vector(pose.R_cam_from_world, offset)])
 
 
 def orthonormal(R: Array) -> Array:
@@ -162,7 +173,7 @@ def orthonormal(R: Array) -> Array:
     step squares the error.
     """
     for _ in range(NEWTON_STEPS):
-        R = R @ (1.5 * np.eye(3) - 0.5 * R.T @ R)
+        R = multiply(R, 1.5 * np.eye(3) - 0.5 * multiply(R.T, R))
     return R
 
 
@@ -205,8 +216,9 @@ def check_transform(
     given = check_pose(Pose(T[:3, :3], T[:3, 3]), label, tolerance)
     R = orthonormal(given.R_cam_from_world)
     if is_from_world:
-        return Pose(other_from_cam.T @ R, -given.R_cam_from_world.T @ given.center_world)
-    return Pose(other_from_cam.T @ R.T, given.center_world)
+        center = -rotate_vector(given.R_cam_from_world.T, given.center_world)
+        return Pose(multiply(other_from_cam.T, R), center)
+    return Pose(multiply(other_from_cam.T, R.T), given.center_world)
 
 
 def angle_between(R_a: Array, R_b: Array) -> float:
@@ -268,8 +280,8 @@ def pose_errors(pose: Pose, true_pose: Pose) -> tuple[float, float]:
 def move(pose: Pose, T_target_from_source: Array, metres_per_unit: float) -> Pose:
     """Return a pose of the source in the target's coordinates; T (4, 4) is rigid, in `metres_per_unit`."""
     R = T_target_from_source[:3, :3]
-    center = R @ pose.center_world + T_target_from_source[:3, 3] * metres_per_unit
-    return Pose(orthonormal(pose.R_cam_from_world @ R.T), center)
+    center = rotate_vector(R, pose.center_world) + T_target_from_source[:3, 3] * metres_per_unit
+    return Pose(orthonormal(multiply(pose.R_cam_from_world, R.T)), center)
 
 
 def rotate_points(points: Array, R_target_from_source: Array) -> Array:
@@ -315,12 +327,12 @@ def uniform_rotations(num_rotations: int) -> Array:
 
 def turn_axes(pose: Pose, other_from_cam: Array) -> Pose:
     """Return the pose with its rotation to another tool's camera axes, by `other_from_cam` (3, 3)."""
-    return Pose(other_from_cam @ pose.R_cam_from_world, pose.center_world)
+    return Pose(multiply(other_from_cam, pose.R_cam_from_world), pose.center_world)
 
 
 def translation(pose: Pose) -> Array:
     """Return the t (3,) of x_cam = R x_world + t."""
-    return np.asarray(-pose.R_cam_from_world @ pose.center_world)
+    return -rotate_vector(pose.R_cam_from_world, pose.center_world)
 
 
 def R_cam_from_angles(heading_deg: float, pitch_deg: float, roll_deg: float) -> Array:
@@ -328,7 +340,7 @@ def R_cam_from_angles(heading_deg: float, pitch_deg: float, roll_deg: float) -> 
     yaw = exp_so3(np.radians([0.0, 0.0, 90.0 - heading_deg]))
     pitch = exp_so3(np.radians([0.0, -pitch_deg, 0.0]))
     roll = exp_so3(np.radians([roll_deg, 0.0, 0.0]))
-    return np.asarray((yaw @ pitch @ roll).T)
+    return multiply(multiply(yaw, pitch), roll).T
 
 
 def heading_pitch_roll_deg(pose: Pose) -> tuple[float, float, float]:

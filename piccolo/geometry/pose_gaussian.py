@@ -12,7 +12,7 @@ import numpy as np
 
 from ..system.arrays import Array, Floats
 from .nearness import Nearness
-from .pose import Pose, exp_so3, log_so3, orthonormal, rotate_points, skew
+from .pose import Pose, exp_so3, log_so3, multiply, orthonormal, rotate_points, skew
 
 LIKELY = 12.6  # chi square of 6 at 95 %: poses that differ by more contradict each other
 LEAST_VARIANCE = 1e-18  # [m^2], [rad^2]
@@ -193,10 +193,10 @@ def differentiate_rays(points_world: Floats, pose: Pose) -> tuple[Array, Array]:
 
 def subtract(pose: Pose, other: Pose) -> Array:
     """Return the step (6,) that takes `other` to `pose`."""
-    turn = log_so3(pose.R_cam_from_world @ other.R_cam_from_world.T)
+    turn = log_so3(multiply(pose.R_cam_from_world, other.R_cam_from_world.T))
     return np.concatenate([turn, pose.center_world - other.center_world])
 
 
 def add(pose: Pose, step: Array) -> Pose:
     """Apply a step (6,) of `subtract`."""
-    return Pose(orthonormal(exp_so3(step[:3]) @ pose.R_cam_from_world), pose.center_world + step[3:])
+    return Pose(orthonormal(multiply(exp_so3(step[:3]), pose.R_cam_from_world)), pose.center_world + step[3:])

@@ -164,10 +164,14 @@ NUM_BLOCKS = len(make_grid(BLOCK_RINGS))
 
 @lru_cache(maxsize=8)
 def make_neighbors(num_rings: int, sigma_deg: float) -> Neighbors:
-    """Compute the Gaussian weights of the cells of a grid within 2.3 sigmas of each cell."""
+    """Compute the Gaussian weights of the cells of a grid within 2.3 sigmas of each cell.
+
+    In float64, and without BLAS: rounded to float32 they are the same on all processors.
+    """
     grid = make_grid(num_rings)
     sigma = np.radians(sigma_deg)
-    cosine = grid.directions @ grid.directions.T
+    x, y, z = grid.directions.T.astype(np.float64)
+    cosine = np.multiply.outer(x, x) + np.multiply.outer(y, y) + np.multiply.outer(z, z)
     rows, cells = np.nonzero(cosine > np.cos(2.3 * sigma))
     weight = np.exp((cosine[rows, cells] - 1) / sigma**2) * grid.solid_angle[cells]
     row = np.searchsorted(rows, np.arange(len(grid) + 1)).astype(np.int32)

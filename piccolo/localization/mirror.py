@@ -6,7 +6,7 @@ import numpy as np
 
 from ..evidence.examine import count_agreeing
 from ..geometry.nearness import ONE_ANSWER
-from ..geometry.pose import Pose, uniform_yaws
+from ..geometry.pose import Pose, multiply, uniform_yaws
 from ..judge.candidate import Candidate
 from ..judge.selection import explains_more
 from ..problem.method import Method
@@ -55,7 +55,7 @@ def search_mirrored(
     best of its scores, at the photo's own pose.
     """
     turned = replace(mirrored, rotations=list_mirrored(pose.R_cam_from_world, effort.num_yaws))
-    own = replace(problem, rotations=pose.R_cam_from_world @ uniform_yaws(effort.num_yaws))
+    own = replace(problem, rotations=multiply(pose.R_cam_from_world, uniform_yaws(effort.num_yaws)))
     own_ends = descend_briefly(own, effort.brief(), workers)
     if not is_found_again(own_ends, pose):
         starts = search_poses(turned, "known", effort, workers)
@@ -69,8 +69,8 @@ def search_mirrored(
 def list_mirrored(R_cam_from_map: Array, num_yaws: int) -> Array:
     """Return rotations (2 N, 3, 3) of a mirrored photo: at the tilt of a pose, and at that upside down."""
     yaws = uniform_yaws(num_yaws)
-    tilt = MIRROR @ R_cam_from_map @ MIRROR
-    return np.asarray(tilt @ np.concatenate([yaws, UPSIDE_DOWN @ yaws]))
+    tilt = multiply(multiply(MIRROR, R_cam_from_map), MIRROR)
+    return multiply(tilt, np.concatenate([yaws, multiply(UPSIDE_DOWN, yaws)]))
 
 
 def is_found_again(ends: Ends, pose: Pose) -> bool:

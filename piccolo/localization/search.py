@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 from ..geometry.nearness import non_maximum_suppression
-from ..geometry.pose import Pose, R_cam_from_angles, uniform_rotations, uniform_yaws
+from ..geometry.pose import Pose, R_cam_from_angles, multiply, uniform_rotations, uniform_yaws
 from ..geometry.sphere import SEARCH_RINGS, make_grid, whole_areas, wider_cells
 from ..photo.panorama.local_normalization import sample_channels
 from ..photo.panorama.texels import Texels
@@ -229,9 +229,10 @@ def list_rotations(problem: Problem, tilts: Tilts, effort: Effort) -> Array:
     if problem.rotations is not None:
         rotations = problem.rotations
     elif tilts == "known":
-        rotations = problem.photo.R_cam_from_level @ uniform_yaws(effort.num_yaws)
+        rotations = multiply(problem.photo.R_cam_from_level, uniform_yaws(effort.num_yaws))
     elif tilts == "level":
-        rotations = problem.photo.R_cam_from_level @ level_rotations()
+        rotations = multiply(problem.photo.R_cam_from_level, level_rotations())
     else:
         rotations = uniform_rotations(effort.num_rotations)
-    return allow_rotations(rotations @ R_map_from_world, problem.prior) @ R_map_from_world.T
+    allowed = allow_rotations(multiply(rotations, R_map_from_world), problem.prior)
+    return multiply(allowed, R_map_from_world.T)

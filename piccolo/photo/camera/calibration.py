@@ -12,7 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from ...geometry.pose import OPTICAL_FROM_CAM, Pose, check_pose, rotation_from_quaternion_wxyz
+from ...geometry.pose import (
+    OPTICAL_FROM_CAM,
+    Pose,
+    check_pose,
+    multiply,
+    rotate_vector,
+    rotation_from_quaternion_wxyz,
+)
 from ...system.arrays import Array
 from ...system.errors import InputError, unreadable
 from ...system.files.json_file import naming, read_bytes, read_text
@@ -69,8 +76,8 @@ class Mount:
 
     def pose(self, pose: Pose) -> Pose:
         """Return the pose of this camera, given the pose of the frame `cam`."""
-        center_world = pose.center_world + pose.R_cam_from_world.T @ np.array(self.center_cam)
-        return Pose(self.rotation @ pose.R_cam_from_world, center_world)
+        center_world = pose.center_world + rotate_vector(pose.R_cam_from_world.T, np.array(self.center_cam))
+        return Pose(multiply(self.rotation, pose.R_cam_from_world), center_world)
 
     def with_camera(self, camera: Camera) -> "Mount":
         """Return another camera at the same place."""
