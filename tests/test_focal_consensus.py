@@ -47,6 +47,11 @@ def test_a_given_focal_length_is_doubted_by_as_much_as_the_picture_can_tell():
     assert Opinion(9.0, 0.01**2).doubt(0.003) < 1.0
 
 
+def test_the_given_focal_length_weighs_by_its_variance():
+    assert Opinion(0.1, 0.02**2).share_of_given(0.01) == pytest.approx(0.8)
+    assert Opinion(0.1, 0.02**2).share_of_given(0.5) == pytest.approx(0.0, abs=0.002)
+
+
 def test_photos_of_one_camera_agree_on_its_focal_length_whatever_some_say():
     """Each is right to its deviation, but for those at a wrong place; the mean has the deviation it says."""
     rng = np.random.default_rng(5)

@@ -19,6 +19,7 @@ from piccolo.geometry.pose_gaussian import probability_of_ball
 from piccolo.geometry.sphere import compute_pixels
 from piccolo.judge.claim import Claim, PictureCorrections, marginal
 from piccolo.judge.result import Result
+from piccolo.judge.result_parts import SphereGeometry
 from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.optimize.corrected_equations import sum_free_equations
 from piccolo.photo.camera import Camera, Mount
@@ -277,6 +278,12 @@ def test_a_panorama_that_was_cut_and_resized_is_taken_as_the_scan_shows_it(bent,
     assert "of 360 x 180 degrees" in result.warnings[-1]
     assert result.cameras[0].camera.model == "PARTIAL_EQUIRECTANGULAR"
     assert Result.from_json(result.to_json()).sphere == result.sphere
+
+
+@pytest.mark.parametrize(("horizon", "side"), [(9.04, "9.0 deg below"), (-3.0, "3.0 deg above")])
+def test_the_warning_says_on_which_side_of_the_middle_the_horizon_is(horizon, side):
+    told = SphereGeometry(360.0, 154.8, horizon, (0.1, 0.1, 0.1)).explain()
+    assert f"360.0 x 154.8 of 360 x 180 degrees, its horizon {side} the middle" in told
 
 
 def test_a_panorama_as_it_is_has_no_geometry_to_tell_of():
