@@ -30,7 +30,7 @@ from piccolo.together.bundle import (
     UNSEEN,
     Posed,
     compare_errors,
-    judge_member,
+    describe_scale,
     localize_bundle,
     merge_places,
 )
@@ -345,6 +345,11 @@ def test_positions_that_are_too_long_are_named():
         assert found.status == "localized"
         assert pose_errors(found.pose, pose)[0] < 0.05
         assert any("too long" in warning for warning in found.warnings)
+
+
+def test_how_much_distances_are_wrong_is_said_in_per_cent():
+    assert describe_scale(-math.log(1.2)) == "20 % too long"
+    assert describe_scale(-math.log(0.9)) == "10 % too short"
 
 
 def test_a_photo_that_shows_nothing_is_not_localized():

@@ -57,10 +57,10 @@ def test_a_place_where_the_others_were_taken_is_not_elsewhere():
         nothing_found(),
         best_pose=here,
         alternatives=(Alternative(far, 0.1, 5),),
-        belief=make_belief([0.6, 0.2]),
+        belief=make_belief([0.6, 0.3]),
     )
     located = [Pose(np.eye(3), center)]
-    assert compute_odds_elsewhere(scan_map, alone, located) == pytest.approx(0.2 / 0.2)
+    assert compute_odds_elsewhere(scan_map, alone, located) == pytest.approx(0.3 / 0.1)
     assert compute_odds_elsewhere(scan_map, nothing_found(), located) == 0.0
 
 
