@@ -31,6 +31,7 @@ from piccolo.together.bundle import (
     Posed,
     compare_errors,
     describe_scale,
+    judge_member,
     localize_bundle,
     merge_places,
 )
