@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from piccolo.system.kernels.jit import inline_kernel
-from research.measuring.kernels import digest_kernel, find_changed, read_measured
+from piccolo.system.kernels.jit import inline_kernel, whole
+from research.measuring.kernels import digest_kernel, find_changed, list_digests, read_measured
 
 pytestmark = pytest.mark.research
 PAGE = Path(__file__).parents[1] / "BENCHMARK.md"
@@ -56,6 +56,12 @@ def test_names_comments_and_types_of_a_kernel_do_not_count():
 @pytest.mark.parametrize("other", [rewritten, calls_another])
 def test_what_a_kernel_and_those_that_it_calls_compute_counts(other):
     assert digest_kernel(other) != digest_kernel(length)
+
+
+def test_a_part_of_kernels_that_python_has_called_is_no_kernel_more():
+    before = list_digests()
+    assert whole(2.5) == 2
+    assert list_digests() == before
 
 
 def test_the_page_was_made_with_these_kernels():

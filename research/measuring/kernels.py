@@ -7,10 +7,12 @@ import ast
 import hashlib
 import importlib
 import inspect
+import sys
 import textwrap
 from functools import cache
 from pathlib import Path
 from types import FunctionType, ModuleType
+from typing import Any
 
 import piccolo
 from piccolo.system.kernels import jit
@@ -68,16 +70,28 @@ def digest_kernel(function: FunctionType) -> str:
     return digest_text(ast.unparse(Renaming(function).visit(definition)))
 
 
+def is_of_piccolo(kernel: Any) -> bool:
+    """Return True for a kernel of `piccolo`.
+
+    Python may have called a part of kernels by itself, which compiles it once more: that is no kernel.
+    """
+    function = kernel.py_func
+    if not function.__module__.startswith("piccolo."):
+        return False
+    return getattr(sys.modules[function.__module__], function.__name__, kernel) is kernel
+
+
 def list_digests() -> dict[str, str]:
     """Return the digest of each kernel of `piccolo`, and of the flags with which all are compiled."""
     root = Path(piccolo.__file__).parent
     for path in sorted(root.rglob("*.py")):
         if "kernels.jit import" in path.read_text():
             importlib.import_module(".".join(path.relative_to(root.parent).with_suffix("").parts))
-    kernels = {name.replace(" ", "+"): kernel for name, kernel in jit.KERNELS.items()}
-    own = sorted(name for name in kernels if name.startswith("piccolo."))
+    kernels = {
+        name.replace(" ", "+"): kernel for name, kernel in jit.KERNELS.items() if is_of_piccolo(kernel)
+    }
     flags = digest_text(" ".join(sorted(jit.FASTMATH)))
-    return {"flags": flags, **{name: describe_value(kernels[name]) for name in own}}
+    return {"flags": flags, **{name: describe_value(kernels[name]) for name in sorted(kernels)}}
 
 
 def list_lines(commit: str) -> list[str]:
