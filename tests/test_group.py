@@ -273,9 +273,10 @@ def _localized():
 
 def test_photos_that_are_not_sure_alone_are_together():
     photos, poses = zip(*taken_photos(), strict=True)
-    shot = Shot(photos[1], rooms.KNOWN)
-    alone = members.find_alone(rooms.scan_map(SEED), shot, rooms.WORKERS, Stopwatch()).alone
-    assert alone.status != "localized"
+    for photo in photos:
+        shot = Shot(photo, rooms.KNOWN)
+        alone = members.find_alone(rooms.scan_map(SEED), shot, rooms.WORKERS, Stopwatch()).alone
+        assert alone.status in ("ambiguous", "not_localized")
     for number, (found, others) in enumerate(_localized()):
         assert found.status == "localized"
         assert others == tuple(k for k in range(3) if k != number)

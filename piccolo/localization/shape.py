@@ -7,7 +7,7 @@ import numpy as np
 
 from ..evidence.comparison import FINE_VIEW, compare
 from ..geometry.nearness import ONE_ANSWER
-from ..geometry.pose import Pose, uniform_yaws, yaw_rotation
+from ..geometry.pose import Pose, multiply, uniform_yaws, yaw_rotation
 from ..geometry.sphere import find_cell, pixel_rays
 from ..judge.candidate import Candidate, Selection
 from ..photo.panorama.gpano import attitude_of_gravity
@@ -55,7 +55,7 @@ def align_lines(yaw_of_walls: float | None, axes: Sequence[Array], R_cam_from_le
     if yaw_of_walls is None or len(level) != 4:
         return None
     yaws = -np.arctan2(level[:, 1], level[:, 0]) - yaw_of_walls
-    return np.stack([R_cam_from_level @ yaw_rotation(float(yaw)) for yaw in yaws])
+    return np.stack([multiply(R_cam_from_level, yaw_rotation(float(yaw))) for yaw in yaws])
 
 
 def align_level(problem: Problem, axes: Sequence[Array], yaw_of_walls: float | None) -> Problem:
@@ -121,5 +121,5 @@ def draw_scan(problem: Problem, pose: Pose, num_yaws: int) -> Problem:
         problem,
         photo=photo,
         profile=choose_profile(photo.small.valid_share, photo.is_partial, True, problem.method),
-        rotations=pose.R_cam_from_world @ uniform_yaws(num_yaws),
+        rotations=multiply(pose.R_cam_from_world, uniform_yaws(num_yaws)),
     )

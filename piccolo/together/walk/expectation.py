@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...geometry.nearness import ONE_PLACE
-from ...geometry.pose import Pose, carry, exp_so3, log_so3
+from ...geometry.pose import Pose, carry, exp_so3, log_so3, multiply
 from .frames import MOST_EXPECTED, Frame, How, Motion, State
 from .path import COPY_LOG_ODDS
 
@@ -63,8 +63,8 @@ def predict(last: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pos
     """
     move = ratio * (last.center_world - earlier.center_world)
     move *= min(1.0, max_distance / max(float(np.linalg.norm(move)), 1e-9))
-    turn = ratio * log_so3(last.R_cam_from_world @ earlier.R_cam_from_world.T)
-    return Pose(exp_so3(turn) @ last.R_cam_from_world, last.center_world + move)
+    turn = ratio * log_so3(multiply(last.R_cam_from_world, earlier.R_cam_from_world.T))
+    return Pose(multiply(exp_so3(turn), last.R_cam_from_world), last.center_world + move)
 
 
 def list_alike(expected: ExpectedFrame, places: Sequence[Place]) -> list[Pose]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...geometry.nearness import ONE_ANSWER, ONE_PLACE, non_maximum_suppression
-from ...geometry.pose import Pose, uniform_yaws
+from ...geometry.pose import Pose, multiply, uniform_yaws
 from ...judge.probability import LOCALIZED, MODELS, Standing, pose_features
 from ...judge.result import Result
 from ...localization.beam import Ends, descend_briefly, score_briefly, score_mirror, score_near
@@ -70,7 +70,7 @@ def narrow_down(problem: Problem, pose: Pose, radius: float, effort: Effort) -> 
     m = problem.scan_map
     distances = np.linalg.norm(m.centers[m.sparse] - pose.center_world, axis=1)
     near = m if math.isinf(radius) else m.narrow(distances <= max(radius, float(distances.min())))
-    level = pose.R_cam_from_world @ uniform_yaws(effort.num_yaws)
+    level = multiply(pose.R_cam_from_world, uniform_yaws(effort.num_yaws))
     close = replace(problem.by_views(), scan_map=near, rotations=level)
     return close, effort.brief(max(len(near.sparse), 1))
 
