@@ -208,7 +208,13 @@ def visit(browser, service):
 
 @pytest.fixture(scope="session")
 def elsewhere(tmp_path_factory):
-    """A panorama of a room that is not in the scan."""
+    """A panorama of a room that is not in the scan.
+
+    It is localized once without a limit of time, so that no browser waits for kernels to be compiled.
+    """
     house = House(tmp_path_factory.mktemp("elsewhere"), 1024)
     house.add(0, "elsewhere.jpg")
-    return house.folder / "photos" / "elsewhere.jpg"
+    photo = house.folder / "photos" / "elsewhere.jpg"
+    words = ["--cloud", str(FLAT / "cloud.ply"), "--cache", "none", "--pano", str(photo), "--quiet"]
+    assert localize.main(words) == 1
+    return photo

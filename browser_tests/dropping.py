@@ -8,7 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 FLAT = ROOT / "examples" / "flat"
-SLOW_MS = 240_000  # for a photo, on a machine that does much else and has no compiled kernels
+SLOW_MS = 120_000  # for a photo, on a machine that does much else
 CHOOSER = "input[type=file][multiple]"
 # keeps the options that are sent in window.told
 LISTEN = """() => {
