@@ -45,7 +45,7 @@ test-all: $(VENV)/ready
 	$(PYTEST)
 
 # of the tests of kernels, those that need seconds in plain Python
-KERNELS := channel_loss cone cloud_morton cloud_octree cloud_profiles p3p pose sampling_loss sphere zbuffer
+KERNELS := channel_loss cone cloud_morton cloud_octree cloud_profiles local_features_sift p3p pose sampling_loss sphere zbuffer
 
 test-kernels: kernels-plain kernels-checked
 

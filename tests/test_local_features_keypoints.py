@@ -9,8 +9,10 @@ from scipy.spatial import cKDTree
 
 from piccolo.geometry.pose import yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.local_features.keypoints import DESCRIPTOR_SIZE, find_keypoints, join_keypoints
-from piccolo.local_features.perspective_view import VIEWS_DEG, cover_sphere
+from piccolo.local_features.keypoints import find_keypoints, join_keypoints
+from piccolo.local_features.perspective_view import VIEWS_DEG, add_margin, cover_sphere
+from piccolo.local_features.scale_space import CONTRAST
+from piccolo.local_features.sift import DESCRIPTOR_SIZE, find_sift
 from piccolo.system.jobs.threads import Workers
 
 WIDTH = rooms.WIDTH
@@ -60,6 +62,21 @@ def test_turning_the_sphere_turns_the_keypoints():
         assert np.median(cosines) > np.cos(np.radians(8.0))
         ratios = turned.sizes[is_same] / own.sizes[nearest[is_same]]
         np.testing.assert_allclose(np.median(ratios), 1, atol=0.05)
+
+
+def test_keypoints_of_a_view_are_those_of_opencv():
+    view = VIEWS[0]
+    picture = view.cut(add_margin(_gray()))
+    detector = cv2.SIFT.create(contrastThreshold=float(CONTRAST), enable_precise_upscale=True)
+    expected = np.array([(*k.pt, k.size, np.radians(k.angle)) for k in detector.detect(picture)])
+    found, _ = find_sift(picture, np.ones_like(picture))
+    places = [np.stack([x, y, 6.0 * np.log(size)], axis=1) for x, y, size, _ in (found.T, expected.T)]
+    distance, nearest = cKDTree(places[0]).query(places[1])
+    assert len(expected) > 50
+    assert abs(len(found) - len(expected)) <= 0.05 * len(expected)
+    assert (distance < 0.1).mean() > 0.97
+    alike = np.cos(found[nearest, 3] - expected[:, 3])
+    assert np.median(alike) > np.cos(0.02)
 
 
 def test_what_views_share_counts_once():

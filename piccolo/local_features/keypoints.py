@@ -1,4 +1,4 @@
-"""Keypoints of a sphere, as rays and sizes: SIFT (Lowe, IJCV 2004) on overlapping perspective views."""
+"""Keypoints of a sphere, as rays and sizes: SIFT on overlapping perspective views."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -9,9 +9,8 @@ import numpy as np
 from ..system.arrays import Array32, Bytes, Int64s, Mask
 from ..system.jobs.threads import Workers
 from .perspective_view import PerspectiveView, add_margin
+from .sift import DESCRIPTOR_SIZE, find_sift
 
-CONTRAST = 0.006  # least contrast of a keypoint, as OpenCV counts it: faint ones on plain walls match well
-DESCRIPTOR_SIZE = 128
 ALONE = Workers()  # the calling thread only
 
 
@@ -52,13 +51,11 @@ def find_keypoints(
 
 def find_in_view(image: Bytes, shown: Bytes, view: PerspectiveView) -> Keypoints:
     """Find the keypoints in the picture (h, w) of a view where `shown` (h, w) is 255; elsewhere it is 0."""
-    inner = cv2.bitwise_and(cv2.erode(shown, np.ones((3, 3), np.uint8)), view.is_own)
+    inner = np.asarray(cv2.bitwise_and(cv2.erode(shown, np.ones((3, 3), np.uint8)), view.is_own), np.uint8)
     if not inner.any():
         return _nothing()
-    sift = cv2.SIFT.create(contrastThreshold=CONTRAST, enable_precise_upscale=True)
-    points, descriptors = sift.detectAndCompute(image, inner)
-    keypoints = _on_sphere(points, np.asarray(descriptors, np.float32), view) if points else _nothing()
-    return keypoints.take(view.find_own(keypoints.rays))  # a keypoint in the overlap of two views counts once
+    found = _on_sphere(*find_sift(image, inner), view)
+    return found.take(view.find_own(found.rays))  # a keypoint in the overlap of two views counts once
 
 
 def join_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
@@ -71,24 +68,23 @@ def _nothing() -> Keypoints:
     return Keypoints(three, three, np.empty(0, np.float32), np.empty((0, DESCRIPTOR_SIZE), np.uint8))
 
 
-def _on_sphere(found: Sequence[cv2.KeyPoint], sift: Array32, view: PerspectiveView) -> Keypoints:
-    """Convert keypoints of a view to rays of the sphere, and their SIFT descriptors (N, 128) to RootSIFT."""
+def _on_sphere(places: Array32, descriptors: Bytes, view: PerspectiveView) -> Keypoints:
+    """Convert the keypoints of a view, as `find_sift` returns them, to rays of the sphere."""
     height, width = view.rows.shape
     per_px = view.pixel
-    points = np.array([(*k.pt, k.size, k.angle) for k in found])
-    angle = np.radians(points[:, 3])
-    left, up = (per_px * (0.5 * size - 0.5 - points[:, k]) for k, size in enumerate((width, height)))
+    columns, rows, diameters, angles = np.asarray(places, np.float64).T
+    left = per_px * (0.5 * width - 0.5 - columns)
+    up = per_px * (0.5 * height - 0.5 - rows)
     rays = np.stack([np.ones_like(left), left, up], axis=1)
-    tangents = np.stack([np.zeros_like(left), -np.cos(angle), -np.sin(angle)], axis=1)
+    tangents = np.stack([np.zeros_like(left), -np.cos(angles), -np.sin(angles)], axis=1)
     length = np.linalg.norm(rays, axis=1, keepdims=True)
     rays /= length
     tangents -= rays * np.sum(rays * tangents, axis=1, keepdims=True)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    sizes = points[:, 2] * per_px / length[:, 0] ** 1.5  # by the solid angle that it covers
-    roots = np.sqrt(sift / np.maximum(sift.sum(axis=1, keepdims=True), 1.0))
+    sizes = diameters * per_px / length[:, 0] ** 1.5  # by the solid angle that it covers
     return Keypoints(
         np.asarray(rays @ view.R_sphere_from_view.T, np.float32),
         np.asarray(tangents @ view.R_sphere_from_view.T, np.float32),
         np.asarray(sizes, np.float32),
-        np.rint(roots * 255.0).astype(np.uint8),
+        descriptors,
     )
