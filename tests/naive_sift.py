@@ -40,7 +40,7 @@ def find_extremes(images):
     is_high = (layers > 0) & (layers == ndimage.maximum_filter(layers, 3))
     is_low = (layers < 0) & (layers == ndimage.minimum_filter(layers, 3))
     is_strong = np.abs(layers) > 0.5 * scale_space.CONTRAST / scale_space.NUM_LAYERS
-    border = scale_space.BORDER
+    border = scale_space.OCTAVE_BORDER
     shape = np.array([scale_space.NUM_LAYERS + 2, *images.shape[1:]])
     lowest, highest = np.array([1, border, border]), shape - [1, border, border]
     found = {}
@@ -112,7 +112,7 @@ def describe(image, x, y, sigma, angle):
     turn = (angles - angle) % math.tau / math.tau * sift.NUM_BINS
     values = np.stack([*(cells + float(sift.CELL_REACH)), turn])[:, inside]
     whole = np.floor(values).astype(int)
-    sums = np.zeros((sift.NUM_CELLS + 2, sift.NUM_CELLS + 2, sift.NUM_BINS))
+    sums = np.zeros((sift.DESCRIPTOR_CELLS + 2, sift.DESCRIPTOR_CELLS + 2, sift.NUM_BINS))
     for corner in itertools.product((0, 1), repeat=3):
         share = np.abs(1 - np.array(corner)[:, None] - (values - whole)).prod(axis=0)
         i, j, k = whole + np.array(corner)[:, None]

@@ -20,13 +20,13 @@ FIRST_SIGMA = 1.6  # [px] blur of an octave's first picture
 CAMERA_SIGMA = 0.5  # [px] blur of a picture as it is given
 BLUR_REACH = 3.5  # standard deviations that a blur reaches, at least
 TAPS = 3  # rows or columns on each side that are added at a time: a blur reaches a multiple of them
-BORDER = 5  # [px] around each octave, without keypoints
+OCTAVE_BORDER = 5  # [px] around each octave, without keypoints
 CONTRAST = np.float32(0.006)  # least contrast of a keypoint, of 1: faint ones on plain walls match well
 EDGE_RATIO = np.float32(10.0)  # of the two curvatures of a keypoint, at most
 MOST_STEPS = 5  # from an extreme pixel to the extreme place beside it
 FAR = np.float32(100.0)  # [px] no extreme place is so far from a pixel
 QUARTER = np.float32(0.25)
-PER_LEVEL = np.float32(1.0 / 255.0)
+PER_BYTE = np.float32(1.0 / 255.0)
 Rows = tuple[Array32, Array32, Array32]
 
 
@@ -57,7 +57,7 @@ def double(image: Bytes, doubled: Array32) -> None:
         above = image[i // 2]
         below = image[min((i + 1) // 2, height - 1)]
         for j in range(width):
-            line[j] = HALF * PER_LEVEL * (np.float32(above[j]) + np.float32(below[j]))
+            line[j] = HALF * PER_BYTE * (np.float32(above[j]) + np.float32(below[j]))
         line[width] = line[width - 1]
         target = doubled[i]
         for j in range(width):
@@ -92,7 +92,7 @@ def add_taps(total: Array32, weights: Array32, k: int, before: Rows, after: Rows
 
 
 @kernel
-def blur(image: Array32, weights: Array32, blurred: Array32) -> None:
+def blur_picture(image: Array32, weights: Array32, blurred: Array32) -> None:
     """Blur a picture (h, w) by half a Gaussian; beyond its border it is reflected."""
     height, width = image.shape
     reach = len(weights) - 1
@@ -238,7 +238,7 @@ def find_extreme(images: Array32, layer: int, y: int, x: int, cube: Array32) -> 
         layer += round(up)
         y += round(down)
         x += round(right)
-        is_inside = BORDER <= y < height - BORDER and BORDER <= x < width - BORDER
+        is_inside = OCTAVE_BORDER <= y < height - OCTAVE_BORDER and OCTAVE_BORDER <= x < width - OCTAVE_BORDER
         if not (is_inside and 1 <= layer <= NUM_LAYERS):
             break
     return F0, F0, F0
@@ -268,16 +268,16 @@ def find_extremes(images: Array32, scale: Scalar, shown: Bytes, places: Array32)
     is_taken = np.zeros((NUM_LAYERS + 1, height, width), np.uint8)  # two pixels may lead to one place
     cube = np.empty((3, 3, 3), np.float32)
     count = 0
-    for below in range(BORDER - 1, height - BORDER + 1):
+    for below in range(OCTAVE_BORDER - 1, height - OCTAVE_BORDER + 1):
         write_differences(images, below, differences)
         y = below - 1
-        if y < BORDER:
+        if y < OCTAVE_BORDER:
             continue
         write_extremes(differences, lowest, highest)
         for layer in range(1, NUM_LAYERS + 1):
             around = slice(layer - 1, layer + 2)
             mark_extremes(differences[y % 3, layer], lowest[around], highest[around], room, is_extreme)
-            for x in range(BORDER, width - BORDER):
+            for x in range(OCTAVE_BORDER, width - OCTAVE_BORDER):
                 if is_extreme[x] == 0:
                     continue
                 place = find_extreme(images, layer, y, x, cube)

@@ -13,7 +13,15 @@ import numpy as np
 from ..geometry.sphere import atan2
 from ..system.arrays import Array32, Bytes, Int32s
 from ..system.kernels.jit import F0, F1, HALF, Scalar, inline_kernel, kernel
-from .scale_space import FIRST_SIGMA, NUM_IMAGES, NUM_LAYERS, blur, double, find_extremes, make_weights
+from .scale_space import (
+    FIRST_SIGMA,
+    NUM_IMAGES,
+    NUM_LAYERS,
+    blur_picture,
+    double,
+    find_extremes,
+    make_weights,
+)
 
 LEAST_SIDE = 16  # [px] of an octave: smaller ones have no room for keypoints
 PIXELS_PER_EXTREME = 4  # at least
@@ -23,26 +31,28 @@ DIRECTIONS_PER_RADIAN = np.float32(NUM_DIRECTIONS / math.tau)
 ORIENTATION_SIGMA = np.float32(1.5)  # times the keypoint's sigma, within which gradients tell its orientation
 ORIENTATION_REACH = np.float32(4.5)  # times the keypoint's sigma
 SECOND_PEAK = np.float32(0.8)  # of the highest: a place has a further orientation
-NUM_CELLS = 4  # rows and columns of a descriptor
+DESCRIPTOR_CELLS = 4  # rows and columns of a descriptor
 NUM_BINS = 8  # directions of a descriptor
 BINS_PER_RADIAN = np.float32(NUM_BINS / math.tau)
 FULL_TURN = np.float32(NUM_BINS)
-DESCRIPTOR_SIZE = NUM_CELLS * NUM_CELLS * NUM_BINS
+DESCRIPTOR_SIZE = DESCRIPTOR_CELLS * DESCRIPTOR_CELLS * NUM_BINS
 CELL_SIGMAS = np.float32(3.0)  # width of a descriptor's cell, times the keypoint's sigma
-CELL_REACH = np.float32(0.5 * (NUM_CELLS + 1))  # of a descriptor from its keypoint, along rows and columns
-DIAGONAL = np.float32(math.sqrt(2.0))
-FALL_OF_CELLS = np.float32(-2.0 / NUM_CELLS**2)  # weights fall with a sigma of half a descriptor
+CELL_REACH = np.float32(
+    0.5 * (DESCRIPTOR_CELLS + 1)
+)  # of a descriptor from its keypoint, along rows and columns
+SQRT_2 = np.float32(math.sqrt(2.0))
+FALL_OF_CELLS = np.float32(-2.0 / DESCRIPTOR_CELLS**2)  # weights fall with a sigma of half a descriptor
 ROW_STEP = 2  # of gradients that are summed: pictures that are blurred by two pixels hold nothing finer
 MOST_SHARE = np.float32(0.2)  # of a descriptor's length that is one direction's in one cell
 # A gradient is divided among eight bins. So that they are always there, the cells have a row and a column
 # more on each side, and a circle has a bin more.
 BINS = np.int32(NUM_BINS + 1)
-CELLS = np.int32(NUM_CELLS + 2)
-LAST_CELL = np.int32(NUM_CELLS)  # that is followed by another
+PADDED_CELLS = np.int32(DESCRIPTOR_CELLS + 2)
+LAST_CELL = np.int32(DESCRIPTOR_CELLS)  # that is followed by another
 LAST_BIN = np.int32(NUM_BINS - 1)
 NEXT = np.uint32(1)  # from a bin to the next
 RIGHT = np.uint32(BINS)  # and to that of the next column
-BELOW = np.uint32(CELLS * BINS)  # and of the next row
+BELOW = np.uint32(PADDED_CELLS * BINS)  # and of the next row
 NUM_NEIGHBORS = 8
 FLAT = np.float32(1e-6)  # slope of a line that has no end
 ENDLESS = np.float32(1e6)  # [px]
@@ -73,7 +83,7 @@ class Place(NamedTuple):
 
 
 @inline_kernel
-def write_gradients(image: Array32, y: int, begin: int, end: int, room: Room) -> None:
+def take_gradients(image: Array32, y: int, begin: int, end: int, room: Room) -> None:
     """Write the gradients of row y from column `begin` to `end`."""
     above = image[y - 1, begin:end]
     below = image[y + 1, begin:end]
@@ -109,7 +119,7 @@ def sum_directions(image: Array32, place: Place, room: Room) -> None:
     write_falls(begin, end, np.float32(x), fall, room.falls)
     room.directions[:] = F0
     for i in range(max(1, y - reach), min(height - 1, y + reach + 1), ROW_STEP):
-        write_gradients(image, i, begin, end, room)
+        take_gradients(image, i, begin, end, room)
         weight = np.float32(math.exp(fall * np.float32((i - y) * (i - y))))
         for k in range(end - begin):
             turn = room.angles[k] * DIRECTIONS_PER_RADIAN + np.float32(0.5 * NUM_DIRECTIONS)
@@ -128,7 +138,7 @@ def smooth_directions(raw: Array32, smooth: Array32) -> None:
 
 
 @inline_kernel
-def find_span(slope: Scalar, offset: Scalar) -> tuple[Scalar, Scalar]:
+def find_ends(slope: Scalar, offset: Scalar) -> tuple[Scalar, Scalar]:
     """Return between which u the sum slope * u + offset is a row or column of a descriptor."""
     if -FLAT < slope < FLAT:
         return (-ENDLESS, ENDLESS) if -CELL_REACH < offset < CELL_REACH else (ENDLESS, -ENDLESS)
@@ -138,7 +148,7 @@ def find_span(slope: Scalar, offset: Scalar) -> tuple[Scalar, Scalar]:
 
 
 @inline_kernel
-def locate(
+def locate_in_cells(
     k: int, start: tuple[Scalar, Scalar], slope: tuple[Scalar, Scalar]
 ) -> tuple[Scalar, Scalar, np.int32, np.int32]:
     """Return row and column of the cells, as floats, at pixel k of a line, and the whole ones before."""
@@ -153,8 +163,8 @@ def divide_gradients(
 ) -> None:
     """Divide the gradients of a line among the nearest rows, columns and directions of a keypoint's axes.
 
-    `start` and `slope` are those of `locate`, `angle` is the keypoint's. These loops are vectorised; adding
-    the parts can't be.
+    `start` and `slope` are those of `locate_in_cells`, `angle` is the keypoint's. These loops are vectorised;
+    adding the parts can't be.
     """
     lengths, turns, bins, parts = room.lengths, room.angles, room.bins, room.parts
     for k in range(count):
@@ -162,10 +172,10 @@ def divide_gradients(
         turn = turn + FULL_TURN if turn < F0 else turn
         turns[k] = turn + FULL_TURN if turn < F0 else turn
     for k in range(count):
-        _, _, i, j = locate(k, start, slope)
-        bins[k] = (i * CELLS + j) * BINS + min(np.int32(turns[k]), LAST_BIN)
+        _, _, i, j = locate_in_cells(k, start, slope)
+        bins[k] = (i * PADDED_CELLS + j) * BINS + min(np.int32(turns[k]), LAST_BIN)
     for k in range(count):
-        row, column, i, j = locate(k, start, slope)
+        row, column, i, j = locate_in_cells(k, start, slope)
         below = lengths[k] * (row - np.float32(i))
         above = lengths[k] - below
         right = column - np.float32(j)
@@ -206,7 +216,7 @@ def sum_gradients(image: Array32, place: Place, angle: Scalar, room: Room) -> No
     cosine = per * np.float32(math.cos(angle))
     sine = per * np.float32(math.sin(angle))
     fall = FALL_OF_CELLS * per * per
-    reach = DIAGONAL * CELL_REACH / per
+    reach = SQRT_2 * CELL_REACH / per
     first = max(1, math.ceil(place.x - reach))
     last = min(width - 2, math.floor(place.x + reach))
     write_falls(first, last + 1, place.x, fall, room.falls)
@@ -214,13 +224,13 @@ def sum_gradients(image: Array32, place: Place, angle: Scalar, room: Room) -> No
         max(1, math.ceil(place.y - reach)), min(height - 1, math.floor(place.y + reach) + 1), ROW_STEP
     ):
         v = np.float32(i) - place.y
-        low, high = find_span(cosine, v * sine)
-        least, most = find_span(-sine, v * cosine)
+        low, high = find_ends(cosine, v * sine)
+        least, most = find_ends(-sine, v * cosine)
         begin = max(first, math.ceil(place.x + max(low, least)))
         count = min(last, math.floor(place.x + min(high, most))) + 1 - begin
         if count <= 0:
             continue
-        write_gradients(image, i, begin, begin + count, room)
+        take_gradients(image, i, begin, begin + count, room)
         weight = np.float32(math.exp(fall * v * v))
         for k in range(count):
             room.lengths[k] *= weight * room.falls[begin - first + k]
@@ -236,9 +246,9 @@ def write_descriptor(room: Room, descriptor: Bytes) -> None:
     sums, shares = room.sums, room.shares
     count = 0
     square = F0
-    for i in range(1, NUM_CELLS + 1):
-        for j in range(1, NUM_CELLS + 1):
-            first = (i * CELLS + j) * BINS
+    for i in range(1, DESCRIPTOR_CELLS + 1):
+        for j in range(1, DESCRIPTOR_CELLS + 1):
+            first = (i * PADDED_CELLS + j) * BINS
             sums[first] += sums[first + NUM_BINS]
             for k in range(NUM_BINS):
                 shares[count] = sums[first + k]
@@ -299,7 +309,7 @@ def make_room(width: int) -> Room:
         np.empty(width, np.int32),
         np.empty((NUM_NEIGHBORS, width), np.float32),
         np.empty(NUM_DIRECTIONS + 1, np.float32),
-        np.empty(CELLS * CELLS * BINS, np.float32),
+        np.empty(PADDED_CELLS * PADDED_CELLS * BINS, np.float32),
         np.empty(DESCRIPTOR_SIZE, np.float32),
     )
 
@@ -310,7 +320,7 @@ def find_in_octave(images: Array32, scale: np.float32, shown: Bytes) -> tuple[Ar
     Its pictures are made from the first. A pixel of the octave is `scale` pixels of the picture.
     """
     for k in range(1, NUM_IMAGES):
-        blur(images[k - 1], WEIGHTS[k], images[k])
+        blur_picture(images[k - 1], WEIGHTS[k], images[k])
     extremes = np.empty((images[0].size // PIXELS_PER_EXTREME, 3), np.float32)
     extremes = extremes[: find_extremes(images, scale, shown, extremes)]
     keypoints = np.empty((MOST_ORIENTATIONS * len(extremes), 4), np.float32)
@@ -324,7 +334,7 @@ def begin_octave(image: Bytes) -> Array32:
     height, width = image.shape
     images = np.empty((NUM_IMAGES, 2 * height, 2 * width), np.float32)
     double(image, images[1])
-    blur(images[1], WEIGHTS[0], images[0])
+    blur_picture(images[1], WEIGHTS[0], images[0])
     return images
 
 
