@@ -22,11 +22,15 @@ def _share(patch, owner, name, key):
     patch.setattr(owner, name, ask)
 
 
-def search_alone_once(patch):
-    """Share what photos find by themselves, for each number of threads."""
+def search_alone_once(patch, is_count_alike=False):
+    """Share what photos find by themselves, for each number of threads or for any, and if they are mirrored.
+
+    What mirrored photos find is shared for each number of threads.
+    """
 
     def alone(scan_map, shot, workers, _):
-        return id(scan_map), _content(shot.panorama), shot.settings, workers.num_threads
+        count = None if is_count_alike else workers.num_threads
+        return id(scan_map), _content(shot.panorama), shot.settings, count
 
     def mirror(member, result, means):
         problem = member.found.problem
