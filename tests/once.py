@@ -46,14 +46,14 @@ def search_alone_once(patch, is_count_alike=False):
 def search_photos_once(patch):
     """Let photos be read as often as they are asked for, but each be searched once.
 
-    That is for each scan, by the digest of its files, and for all settings.
+    That is for each scan, by the digest of its files and its points, and for all settings.
     """
 
     def search(prepared, picture, settings, *means):
         workers = means[0] if len(means) > 1 else means[0].workers
         assert len(means) > 1 or not means[0].trace.is_wanted, "the steps of each search"
-        assert prepared.scan_sha256
-        return prepared.scan_sha256, *_content(picture), settings, workers.num_threads
+        points = prepared.points.stack().tobytes()  # maps that tests make have no digest
+        return prepared.scan_sha256, points, *_content(picture), settings, workers.num_threads
 
     for name in ("localize", "localize_by_paper"):
         _share(patch, scan_photo, name, search)
