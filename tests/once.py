@@ -9,6 +9,11 @@ def _content(panorama):
     return panorama.rgb.tobytes(), panorama.is_valid.tobytes()
 
 
+def _points(prepared):
+    """What tells a scan from others: maps that tests make have no digest."""
+    return prepared.points.stack().tobytes()
+
+
 def _share(patch, owner, name, key):
     """Let a function compute once for each key of its arguments."""
     known = {}
@@ -26,18 +31,19 @@ def _share(patch, owner, name, key):
 def search_alone_once(patch, is_count_alike=False):
     """Share what photos find by themselves, for each number of threads or for any, and if they are mirrored.
 
-    What mirrored photos find is shared for each number of threads.
+    What mirrored photos find is shared for each number of threads; a search whose steps are noted is not.
     """
 
     def alone(scan_map, shot, workers, _):
         count = None if is_count_alike else workers.num_threads
-        return id(scan_map), _content(shot.panorama), shot.settings, count
+        traced = object() if shot.trace.is_wanted else None
+        return _points(scan_map), _content(shot.panorama), shot.settings, count, traced
 
     def mirror(member, result, means):
         problem = member.found.problem
         pose = result.best_pose and result.best_pose.key
         known = _content(problem.photo.panorama), pose, result.confidence
-        return id(problem.scan_map), *known, means.workers.num_threads
+        return _points(problem.scan_map), *known, means.workers.num_threads
 
     _share(patch, members, "find_alone", alone)
     _share(patch, mirrored, "compare_mirrored", mirror)
@@ -46,14 +52,13 @@ def search_alone_once(patch, is_count_alike=False):
 def search_photos_once(patch):
     """Let photos be read as often as they are asked for, but each be searched once.
 
-    That is for each scan, by the digest of its files and its points, and for all settings.
+    That is for each scan, by its points, and for all settings.
     """
 
     def search(prepared, picture, settings, *means):
         workers = means[0] if len(means) > 1 else means[0].workers
         assert len(means) > 1 or not means[0].trace.is_wanted, "the steps of each search"
-        points = prepared.points.stack().tobytes()  # maps that tests make have no digest
-        return prepared.scan_sha256, points, *_content(picture), settings, workers.num_threads
+        return _points(prepared), *_content(picture), settings, workers.num_threads
 
     for name in ("localize", "localize_by_paper"):
         _share(patch, scan_photo, name, search)
