@@ -9,6 +9,7 @@ import rooms
 import tiers
 from batches import COARSE
 from consistency import contradictions_of_line, find_contradictions, lines_of_results
+from once import search_alone_once, search_photos_once
 
 from piccolo.cloud.readers import e57, las, mesh, reader, text
 from piccolo.judge.result import Result
@@ -145,6 +146,15 @@ def coarse_colors():
         for module in (alignment, passersby):
             for name, value in COARSE[module.__name__.rpartition(".")[2]].items():
                 patch.setattr(module, name, value)
+        yield
+
+
+@pytest.fixture(scope="module")
+def searched_once():
+    """A photo is searched once for all tests of a module, as often as it is read."""
+    with pytest.MonkeyPatch.context() as patch:
+        search_photos_once(patch)
+        search_alone_once(patch)
         yield
 
 

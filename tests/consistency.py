@@ -1,5 +1,6 @@
 """What holds of every result: checked for each that a test makes, and for each line that it writes."""
 
+import functools
 import json
 from itertools import combinations
 from pathlib import Path
@@ -120,6 +121,7 @@ def check_times(result):
         yield f"a frame at {result.walk.time} s"
 
 
+@functools.lru_cache(maxsize=4096)  # a line is checked as it is written, and in its file
 def contradictions_of_line(text):
     """Return what is wrong with a result's JSON: by the schema, or as it is another after it was read."""
     errors = [error.message for error in VALIDATOR.iter_errors(json.loads(text))]

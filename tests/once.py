@@ -1,11 +1,19 @@
-"""Photos that several tests localize together are searched by themselves once for all tests of a module."""
+"""Photos that several tests localize are searched by themselves once for all tests of a module."""
 
+from piccolo.api import scan_photo
 from piccolo.together import members, mirrored
 
 
 def _content(panorama):
-    assert (panorama.gpano, panorama.cameras) == (None, ()), "a plain picture"
+    """What a plain picture shows; one of another camera is like no other."""
+    if (panorama.gpano, panorama.cameras) != (None, ()):
+        return object(), None
     return panorama.rgb.tobytes(), panorama.is_valid.tobytes()
+
+
+def _points(prepared):
+    """What tells a scan from others: maps that tests make have no digest."""
+    return prepared.points.stack().tobytes()
 
 
 def _share(patch, owner, name, key):
@@ -22,17 +30,37 @@ def _share(patch, owner, name, key):
     patch.setattr(owner, name, ask)
 
 
-def search_alone_once(patch):
-    """Share what photos find by themselves, for each number of threads."""
+def search_alone_once(patch, is_count_alike=False):
+    """Share what photos find by themselves, for each number of threads or for any, and if they are mirrored.
+
+    What mirrored photos find is shared for each number of threads; a search whose steps are noted is not.
+    """
 
     def alone(scan_map, shot, workers, _):
-        return id(scan_map), _content(shot.panorama), shot.settings, workers.num_threads
+        count = None if is_count_alike else workers.num_threads
+        traced = object() if shot.trace.is_wanted else None
+        return _points(scan_map), _content(shot.panorama), shot.settings, count, traced
 
     def mirror(member, result, means):
         problem = member.found.problem
         pose = result.best_pose and result.best_pose.key
         known = _content(problem.photo.panorama), pose, result.confidence
-        return id(problem.scan_map), *known, means.workers.num_threads
+        return _points(problem.scan_map), *known, means.workers.num_threads
 
     _share(patch, members, "find_alone", alone)
     _share(patch, mirrored, "compare_mirrored", mirror)
+
+
+def search_photos_once(patch):
+    """Let photos be read as often as they are asked for, but each be searched once.
+
+    That is for each scan, by its points, and for all settings.
+    """
+
+    def search(prepared, picture, settings, *means):
+        workers = means[0] if len(means) > 1 else means[0].workers
+        assert len(means) > 1 or not means[0].trace.is_wanted, "the steps of each search"
+        return _points(prepared), *_content(picture), settings, workers.num_threads
+
+    for name in ("localize", "localize_by_paper"):
+        _share(patch, scan_photo, name, search)

@@ -108,14 +108,21 @@ def scan(seed, num_threads=2, num_points=NUM_POINTS):
     return Scan(prepared, "room", CloudSettings(), AUTO, Workers(num_threads), {})
 
 
+def turned_poses(seed, offset_by_eighth):
+    """Poses in a room, at offsets (3,) from a place and turned by eighths."""
+    base = query(seed).pose
+    turns = {eighth: yaw_rotation(eighth * math.pi / 4.0) for eighth in offset_by_eighth}
+    return [
+        Pose(turns[eighth] @ base.R_cam_from_world, base.center_world + np.array(offset))
+        for eighth, offset in offset_by_eighth.items()
+    ]
+
+
 def take_photos(seed, fov_deg, offset_by_eighth, width=WIDTH):
     """Photos of a room, at offsets (3,) from a place and turned by eighths, each with its true pose."""
     world = room(seed)[0]
-    base = query(seed).pose
     taken = []
-    for eighth, offset in offset_by_eighth.items():
-        turn = yaw_rotation(eighth * math.pi / 4.0)
-        pose = Pose(turn @ base.R_cam_from_world, base.center_world + np.array(offset))
+    for pose in turned_poses(seed, offset_by_eighth):
         rgb = photograph(world.rooms[0], pose, width, Workers(2))
         taken.append((Panorama(rgb, ~mask_outside_field(width, fov_deg, 0.0)), pose))
     return taken

@@ -21,6 +21,7 @@ from research.datasets import true_poses
 from research.scene import Query, read_scene, write_queries
 
 TIER = "scene"
+pytestmark = pytest.mark.usefixtures("searched_once")
 
 ROOT = Path(__file__).resolve().parents[1]
 TURN = np.array([1.4, 0.6, -0.3])

@@ -21,6 +21,7 @@ from piccolo.system.errors import InputError
 from research.scene import read_scene
 
 TIER = "scene"
+pytestmark = pytest.mark.usefixtures("searched_once")
 
 
 @pytest.fixture

@@ -42,6 +42,7 @@ from piccolo.together.second_looks import Look
 from research.synthetic.world import render_picture
 
 TIER = "scene"
+pytestmark = pytest.mark.usefixtures("searched_once")
 
 
 def test_a_doubtful_photo_is_sure_beside_another(tmp_path):

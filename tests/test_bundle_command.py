@@ -19,6 +19,7 @@ from piccolo.photo.photo import Photo
 from research.scene import read_scene
 
 TIER = "scene"
+pytestmark = pytest.mark.usefixtures("searched_once")
 
 COMMON_FROM_WORLD = Pose(exp_so3(np.array([0.3, -0.2, 2.0])), np.array([3.0, -1.0, 2.0]))
 NAMES = ("clean_2.jpg", "clean_0.jpg", "clean_1.jpg")  # in another order than in the files

@@ -201,11 +201,11 @@ def test_what_is_no_camera_is_refused(values, message):
 
 BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 TILT = tuple(map(tuple, exp_so3(np.array([0.3, -0.2, 2.0])).tolist()))
-FISHEYE = Camera("OPENCV_FISHEYE", 400, 400, (118.0, 119.0, 201.0, 199.0, 0.01, -0.003, 0.0, 0.0), 96.0)
+FISHEYE = Camera("OPENCV_FISHEYE", 240, 240, (71.0, 71.5, 121.0, 119.0, 0.01, -0.003, 0.0, 0.0), 96.0)
 LENSES = {
-    "pinhole": (Mount(pinhole(480, 360, 300.0)),),
-    "wide": (Mount(Camera("OPENCV", 500, 400, (150.0, 152.0, 255.0, 190.0, -0.02, 0.001, 1e-3, -1e-3))),),
-    "dual fisheye": (Mount(FISHEYE, TILT), Mount(FISHEYE, BACK, offset=(400, 0))),
+    "pinhole": (Mount(pinhole(320, 240, 200.0)),),
+    "wide": (Mount(Camera("OPENCV", 350, 280, (105.0, 106.0, 178.0, 133.0, -0.02, 0.001, 1e-3, -1e-3))),),
+    "dual fisheye": (Mount(FISHEYE, TILT), Mount(FISHEYE, BACK, offset=(240, 0))),
 }
 
 
@@ -215,7 +215,7 @@ def place():
     workers = Workers(2)
     pose = make_query(world, 0, "tilt", 128, workers).pose
     this, _, _ = pose_of_query(world, 0, "tilt")
-    return this, pose, photograph(this, pose, 2048, workers)
+    return this, pose, photograph(this, pose, 1536, workers)
 
 
 @pytest.mark.parametrize("lens", LENSES)

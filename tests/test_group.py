@@ -13,7 +13,7 @@ from made_up import make_candidate
 from once import search_alone_once
 
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
-from piccolo.geometry.pose_gaussian import PoseGaussian
+from piccolo.geometry.pose_gaussian import PoseGaussian, add, subtract
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import NO_CANDIDATE
 from piccolo.judge.reasons import MIRRORED, Reason
@@ -28,6 +28,7 @@ from piccolo.together.expected import Expected
 from piccolo.together.group import localize_group, weigh_supports
 from piccolo.together.links import FIRM, WEAK, Links, Placed, compute_shared, find_links, list_pairs, spread
 from piccolo.together.members import Shot
+from piccolo.together.optima import spread_optima
 
 TIER = "scene"
 SUPPORT = Support(NO_CANDIDATE, None, is_found=True, odds=1.0, odds_elsewhere=0.0, num_places=100)
@@ -35,8 +36,9 @@ SUPPORT = Support(NO_CANDIDATE, None, is_found=True, odds=1.0, odds_elsewhere=0.
 
 @pytest.fixture(autouse=True, scope="module")
 def _searched_once():
+    """That photos alone find the same at any number of threads is tested with bundles."""
     with pytest.MonkeyPatch.context() as patch:
-        search_alone_once(patch)
+        search_alone_once(patch, is_count_alike=True)
         yield
 
 
@@ -284,6 +286,20 @@ def test_photos_that_are_not_sure_alone_are_together():
         assert distance < 0.05
         assert np.degrees(angle) < 1.5
         assert distance < 4.0 * found.covariance.largest_std
+
+
+def test_a_photo_of_a_made_room_is_as_uncertain_as_it_is_wrong():
+    """Not sure alone; the true pose is within what its covariance and the optima tell."""
+    scan_map = rooms.scan_map(SEED)
+    photo, true = taken_photos()[1]
+    member = members.find_alone(scan_map, Shot(photo, rooms.KNOWN), rooms.WORKERS, Stopwatch())
+    own = next(one for one, _ in member.own_poses if one.pose.distance(scan_map.from_world(true)) < 0.3)
+    gaussian = replace(member.alone.gaussian, pose=own.pose)
+    spread = spread_optima(member.found.problem.forget(), own, gaussian, rooms.WORKERS)
+    step = subtract(scan_map.from_world(true), own.pose)
+    assert step @ np.linalg.solve(gaussian.covariance + spread, step) < 12.6
+    assert 0.0 < np.sqrt(np.trace(spread[3:, 3:])) < 0.3
+    assert add(own.pose, step).distance(scan_map.from_world(true)) < 1e-9
 
 
 def _bits(found):

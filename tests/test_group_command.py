@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import rooms
-from groups import SEED, taken_photos
+from groups import SEED, true_places
 from pictures import encoded, write
 from services import serving
 
@@ -24,7 +24,6 @@ from research.synthetic.world import render_picture
 TIER = "scene"
 
 SIZE = (400, 300)
-NEAR = (*(round(x, 1) for x in taken_photos()[0][1].center_world.tolist()), 1.0)  # [m] place and radius
 FOCAL = 0.5 * SIZE[0] / math.tan(math.radians(37.5))
 
 
@@ -32,9 +31,14 @@ FOCAL = 0.5 * SIZE[0] / math.tan(math.radians(37.5))
 def folder(tmp_path_factory):
     """Photos that overlap."""
     made = tmp_path_factory.mktemp("a phone")
-    for k, (_, pose) in enumerate(taken_photos()):
+    for k, pose in enumerate(true_places()):
         _take(made / f"{k}.png", pose)
     return made
+
+
+def _near_first():
+    """Place and radius [m] around the first photo."""
+    return (*(round(x, 1) for x in true_places()[0].center_world.tolist()), 1.0)
 
 
 def _take(path, pose):
@@ -59,7 +63,7 @@ def _command(folder, *options):
         "--gravity",
         "known",
         "--near",
-        *NEAR,
+        *_near_first(),
         *options,
     ]
     return list(map(str, words))
@@ -86,13 +90,14 @@ def panoramas(tmp_path_factory):
 def test_the_service_localizes_photos_together_as_the_command_does(client, panoramas, tmp_path):
     out = tmp_path / "poses.jsonl"
     words = ["--cloud", str(rooms.map_path(SEED)), "--gravity", "known", "--mask-nadir", "20", "--quiet"]
-    given = ["--near", *map(str, NEAR), "--pano", str(panoramas), "--together"]
+    given = ["--near", *map(str, _near_first()), "--pano", str(panoramas), "--together"]
     assert main([*words, *given, "--out", str(out)]) != 0, "one can't be read"
     lines = list(map(untimed_line, out.read_text().splitlines()))
     assert [line["status"] for line in lines] == ["localized", "unreadable", "localized"]
     assert all(line["settings"]["together"] for line in lines[::2])
     pictures = {path.name: path.read_bytes() for path in sorted(panoramas.iterdir())}
-    near = {"near": NEAR[:3], "radius": NEAR[3]}
+    *center, radius = _near_first()
+    near = {"near": center, "radius": radius}
     asked = {"photo": {"mask_nadir_deg": 20}, "prior": near, "gravity": "known", "together": True}
     status, _, body = client.post_all("/localize", pictures, asked)
     assert client.post_all("/localize", pictures, asked | {"together": "yes"})[0] == 400
@@ -111,7 +116,7 @@ def test_the_service_localizes_photos_together_as_the_command_does(client, panor
 def test_a_batch_looks_at_photos_that_are_not_sure_together(folder, client, tmp_path, capsys):
     """One of three is localized alone; the service says the same, and a second run has nothing to do."""
     out = tmp_path / "poses.jsonl"
-    _, first = taken_photos()[0]
+    first = true_places()[0]
     sure = Pose(first.R_cam_from_world @ yaw_rotation(math.radians(30.0)), first.center_world)
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -135,7 +140,8 @@ def test_a_batch_looks_at_photos_that_are_not_sure_together(folder, client, tmp_
     assert "nothing is left to do" in capsys.readouterr().err
     assert out.read_bytes() == before
     pictures = {name.name: name.read_bytes() for name in names}
-    near = {"near": NEAR[:3], "radius": NEAR[3]}
+    *center, radius = _near_first()
+    near = {"near": center, "radius": radius}
     asked = {"photo": {"focal_px": FOCAL}, "prior": near, "gravity": "known"}
     _, _, body = client.post_all("/localize", pictures, asked)
     for answer, line in zip(map(untimed_line, body.decode().splitlines()), lines, strict=True):

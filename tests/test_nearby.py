@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rooms
-from groups import SEED, taken_photos
+from groups import SEED, one_taken, true_places
 
 from piccolo.geometry.pose import Pose, pose_errors
 from piccolo.judge.belief import make_belief
@@ -78,16 +78,16 @@ def test_only_what_is_within_reach_of_a_pose_is_searched():
 
 def _nearby(located, alone, min_confidence=0.9):
     scan_map = rooms.scan_map(SEED)
-    shot = Shot(taken_photos()[1][0], replace(rooms.KNOWN, min_confidence=min_confidence))
+    shot = Shot(one_taken(1)[0], replace(rooms.KNOWN, min_confidence=min_confidence))
     means = Means(rooms.KNOWN.effort, rooms.WORKERS, Stopwatch())
     return localize_nearby(scan_map, shot, alone, located, means)
 
 
 def test_a_photo_is_found_where_the_others_were_taken():
     scan_map = rooms.scan_map(SEED)
-    located = [scan_map.from_world(taken_photos()[k][1]) for k in (0, 2)]
+    located = [scan_map.from_world(true_places()[k]) for k in (0, 2)]
     found = _nearby(located, nothing_found(), 0.5)
-    distance, angle = pose_errors(scan_map.to_world(found.gaussian.pose), taken_photos()[1][1])
+    distance, angle = pose_errors(scan_map.to_world(found.gaussian.pose), one_taken(1)[1])
     assert distance < 0.1
     assert np.degrees(angle) < 2.0
     assert found.status == "localized"

@@ -6,22 +6,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rooms
-from groups import SEED, taken_photos
 from made_up import PARTIAL, PROBLEM, make_candidate, make_selection, move
 
 from piccolo.geometry.pose import Pose
-from piccolo.geometry.pose_gaussian import PoseGaussian, add, subtract
+from piccolo.geometry.pose_gaussian import PoseGaussian
 from piccolo.judge.alternatives import Hypothesis
 from piccolo.judge.belief import make_belief
 from piccolo.judge.result import nothing_found
-from piccolo.localization.means import Means
-from piccolo.system.jobs.threads import Stopwatch
 from piccolo.together import optima
 from piccolo.together.bundle_search import Support
-from piccolo.together.members import Shot, find_alone
 from piccolo.together.optima import spread_optima, widen_unsure
 
-TIER = "scene"
 OWN = make_candidate(0.0, 0.6, num_matches=20)
 ALONG_X = np.diag([1e-8, 1e-8, 1e-8, 0.03**2, 0.01**2, 0.005**2])  # which is determined least
 GAUSSIAN = PoseGaussian(OWN.pose, ALONG_X, np.zeros((6, 6)))
@@ -89,18 +84,3 @@ def test_only_own_poses_that_are_not_sure_alone_are_widened(monkeypatch):
     assert list(widened) == list(supports)
     assert changed == {1, 2}
     assert np.allclose(widened[2].gaussian.own, ALONG_X + np.eye(6))
-
-
-def test_a_photo_of_a_made_room_is_as_uncertain_as_it_is_wrong():
-    """Not sure alone; the true pose is within what its covariance and the optima tell."""
-    scan_map = rooms.scan_map(SEED)
-    photo, true = taken_photos()[1]
-    member = find_alone(scan_map, Shot(photo, rooms.KNOWN), rooms.WORKERS, Stopwatch())
-    own = next(one for one, _ in member.own_poses if one.pose.distance(scan_map.from_world(true)) < 0.3)
-    gaussian = replace(member.alone.gaussian, pose=own.pose)
-    means = Means(rooms.KNOWN.effort, rooms.WORKERS, Stopwatch())
-    spread = spread_optima(member.found.problem.forget(), own, gaussian, means.workers)
-    step = subtract(scan_map.from_world(true), own.pose)
-    assert step @ np.linalg.solve(gaussian.covariance + spread, step) < 12.6
-    assert 0.0 < np.sqrt(np.trace(spread[3:, 3:])) < 0.3
-    assert add(own.pose, step).distance(scan_map.from_world(true)) < 1e-9

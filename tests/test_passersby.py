@@ -8,6 +8,7 @@ import naive
 import numpy as np
 import pytest
 import rooms
+from batches import COARSE
 
 from piccolo.cloud.octree import build_octree
 from piccolo.photo.panorama import Panorama
@@ -93,6 +94,8 @@ def _photos(places):
 def test_of_people_hardly_anything_remains(monkeypatch):
     """In three photos, of which many points of the room are seen by one or two alone."""
     monkeypatch.setattr(alignment, "POINTS_PER_PHOTO", 0)
+    for name, value in COARSE["passersby"].items():
+        monkeypatch.setattr(passersby, name, value)
     photos, poses = _photos([(100, 300), (220,), (330, 20)])
     octree = _octree()
     gains = np.ones((3, 3), np.float32)

@@ -9,6 +9,7 @@ from meshes import Gltf, obj_text
 from pcd_files import ENCODINGS, content_of
 from plyfile import PlyData, PlyElement
 from rooms import assert_near
+from scipy.spatial import cKDTree
 
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.stream import FORMATS, open_cloud
@@ -33,8 +34,8 @@ SETUPS = (
 
 @pytest.fixture(scope="module")
 def raw(scene):
-    """A quarter of the points of the scene."""
-    vertices = PlyData.read(scene / "cloud.ply")["vertex"].data[::4]
+    """An eighth of the points of the scene."""
+    vertices = PlyData.read(scene / "cloud.ply")["vertex"].data[::8]
     points = np.stack([vertices[name] for name in "xyz"], axis=1).astype(np.float64)
     return RawCloud(points, np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1))
 
@@ -159,6 +160,12 @@ def test_a_scan_in_any_format_is_read_with_any_number_of_threads(name, raw, scen
         found.append(Result.from_json(out).pose)
         assert_near(found[-1], pose, 0.03, 0.5)
         assert np.array_equal(found[-1].center_world, found[0].center_world)
+    cloud = open_cloud([path]).read()
+    points = (cloud.points + cloud.origin_world - origin) @ R_file_from_scene
+    distances, nearest = cKDTree(points).query(raw.points_world)
+    assert distances.max() < SIDE
+    is_alike = np.abs(cloud.colors[nearest].astype(int) - raw.colors).max(axis=1) <= 1
+    assert is_alike.mean() > 0.95  # points of triangles may lie nearer to others
     read_by(4000, 50_000)  # in several parts
     one, two = (open_cloud([path]).voxels(UNTURNED, Workers(num_threads)) for num_threads in (1, 2))
     assert np.array_equal(one.codes, two.codes)

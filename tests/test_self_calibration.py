@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import rooms
 from rooms import as_panorama
-from scipy import stats
+from scipy import special
 from scipy.spatial.transform import Rotation
 
 from piccolo.evidence.claimed_sphere import CLAIM, SphereFit, count_deviations
@@ -198,8 +198,8 @@ def test_what_few_blocks_tell_contradicts_a_claim_less():
     off = np.array([4.0 * math.hypot(0.1, 0.01)])
     for num_blocks in (3, 8, 1000):
         by_picture = PictureCorrections(off, information, np.ones((num_blocks, 1, 1)))
-        chance = 2.0 * stats.t.sf(4.0, num_blocks)
-        assert claim.conflict(by_picture) == pytest.approx(stats.norm.isf(0.5 * chance), rel=0.03)
+        chance = 2.0 * special.stdtr(num_blocks, -4.0)
+        assert claim.conflict(by_picture) == pytest.approx(-special.ndtri(0.5 * chance), rel=0.03)
     uneven = PictureCorrections(off, information, np.array([1.0, *[1e-6] * 20])[:, None, None])
     assert claim.conflict(uneven) < 2.0
     exact = PictureCorrections(np.array([0.04]), np.array([[1.0 / 0.001**2]]), np.ones((3, 1, 1)))

@@ -194,14 +194,14 @@ def test_intensity_is_a_channel_of_its_own():
         settings = rooms.KNOWN
         photo = rooms.as_panorama(rooms.query(PATTERNED, width=WIDTH).rgb)
         pose = rooms.locate(photo, scan_map, settings).best_pose
-        found[name] = rooms.errors(pose, rooms.query(PATTERNED).pose)[0]
+        found[name] = rooms.errors(pose, rooms.query(PATTERNED, width=WIDTH).pose)[0]
     assert found["intensity"] < 0.03
     assert found["shape"] > 1.0
 
 
 @pytest.mark.parametrize("R", [LEVEL, exp_so3(np.array([0.0, 0.1, 0.0])), TILTED])
 def test_the_true_rotation_is_one_of_four_by_lines_and_walls(R):
-    true = R @ rooms.query(SEED).pose.R_cam_from_world @ _shape_map().R_map_from_world.T
+    true = R @ rooms.query(SEED, width=WIDTH).pose.R_cam_from_world @ _shape_map().R_map_from_world.T
     axes = [*true.T, *-true.T]  # the walls of the room are along x and y
     tried = align_lines(_shape_map().yaw_of_walls, axes, R)
     assert tried.shape == (4, 3, 3)
