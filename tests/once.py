@@ -30,16 +30,15 @@ def _share(patch, owner, name, key):
     patch.setattr(owner, name, ask)
 
 
-def search_alone_once(patch, is_count_alike=False):
-    """Share what photos find by themselves, for each number of threads or for any, and if they are mirrored.
+def search_alone_once(patch):
+    """Share what photos find by themselves, and if they are mirrored, for each number of threads.
 
-    What mirrored photos find is shared for each number of threads; a search whose steps are noted is not.
+    A search whose steps are noted is not shared.
     """
 
     def alone(scan_map, shot, workers, _):
-        count = None if is_count_alike else workers.num_threads
         traced = object() if shot.trace.is_wanted else None
-        return _points(scan_map), _content(shot.panorama), shot.settings, count, traced
+        return _points(scan_map), _content(shot.panorama), shot.settings, workers.num_threads, traced
 
     def mirror(member, result, means):
         problem = member.found.problem
