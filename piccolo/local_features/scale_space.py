@@ -265,7 +265,7 @@ def find_extremes(images: Array32, scale: Scalar, shown: Bytes, places: Array32)
     highest = np.empty(differences.shape[1:], np.float32)
     room = np.empty((2, width), np.float32)
     is_extreme = np.zeros(width, np.uint8)
-    is_taken = np.zeros((NUM_LAYERS + 1, height, width), np.uint8)  # two pixels may lead to one place
+    is_taken = np.zeros((NUM_IMAGES, height, width), np.uint8)  # two pixels may lead to one place
     cube = np.empty((3, 3, 3), np.float32)
     count = 0
     for below in range(OCTAVE_BORDER - 1, height - OCTAVE_BORDER + 1):

@@ -37,9 +37,7 @@ BINS_PER_RADIAN = np.float32(NUM_BINS / math.tau)
 FULL_TURN = np.float32(NUM_BINS)
 DESCRIPTOR_SIZE = DESCRIPTOR_CELLS * DESCRIPTOR_CELLS * NUM_BINS
 CELL_SIGMAS = np.float32(3.0)  # width of a descriptor's cell, times the keypoint's sigma
-CELL_REACH = np.float32(
-    0.5 * (DESCRIPTOR_CELLS + 1)
-)  # of a descriptor from its keypoint, along rows and columns
+CELL_REACH = np.float32(0.5 * (DESCRIPTOR_CELLS + 1))  # of a descriptor, along its rows and columns
 SQRT_2 = np.float32(math.sqrt(2.0))
 FALL_OF_CELLS = np.float32(-2.0 / DESCRIPTOR_CELLS**2)  # weights fall with a sigma of half a descriptor
 ROW_STEP = 2  # of gradients that are summed: pictures that are blurred by two pixels hold nothing finer
