@@ -117,7 +117,7 @@ def test_a_batch_looks_at_photos_that_are_not_sure_together(folder, client, tmp_
     """One of three is localized alone; the service says the same, and a second run has nothing to do."""
     out = tmp_path / "poses.jsonl"
     first = true_places()[0]
-    sure = Pose(first.R_cam_from_world @ yaw_rotation(math.radians(30.0)), first.center_world)
+    sure = Pose(first.R_cam_from_world @ yaw_rotation(math.radians(35.0)), first.center_world)
     photos = tmp_path / "photos"
     photos.mkdir()
     for name in ("0.png", "1.png"):

@@ -27,7 +27,7 @@ from research.synthetic.world import render_picture
 TIER = "scene"
 
 FOCAL = 1.03 * TRUE  # as it is told, 3 % too long
-TURNS = (0, 1, 2, 5)  # of the photos, in quarters of a radian
+TURNS = (0.5, 1, 2, 5)  # of the photos, in quarters of a radian
 COLOR = "photo {}.png"
 
 
