@@ -16,10 +16,8 @@ SIGMAS = [
 def make_octaves(picture):
     """The pictures (6, h, w) of each octave of a picture (h, w), from 0 to 1, each with its pixels' size."""
     height, width = picture.shape
-    rows, columns = (
-        np.minimum(np.arange(2 * height) / 2, height - 1),
-        np.minimum(np.arange(2 * width) / 2, width - 1),
-    )
+    rows = np.minimum(np.arange(2 * height) / 2, height - 1)
+    columns = np.minimum(np.arange(2 * width) / 2, width - 1)
     places = np.meshgrid(rows, columns, indexing="ij")
     image = ndimage.map_coordinates(picture / 255.0, places, order=1)
     before = 2.0 * scale_space.CAMERA_SIGMA
@@ -42,7 +40,8 @@ def find_extremes(images):
     is_strong = np.abs(layers) > 0.5 * scale_space.CONTRAST / scale_space.NUM_LAYERS
     border = scale_space.OCTAVE_BORDER
     shape = np.array([scale_space.NUM_LAYERS + 2, *images.shape[1:]])
-    lowest, highest = np.array([1, border, border]), shape - [1, border, border]
+    lowest = np.array([1, border, border])
+    highest = shape - [1, border, border]
     found = {}
     for pixel in np.argwhere((is_high | is_low) & is_strong):
         at = pixel
@@ -81,7 +80,8 @@ def gradients_around(image, x, y, reach):
     )
     columns = np.arange(max(1, int(np.ceil(x - reach))), min(width - 1, int(np.floor(x + reach)) + 1))
     i, j = (values.ravel() for values in np.meshgrid(rows, columns, indexing="ij"))
-    across, down = image[i, j + 1] - image[i, j - 1], image[i + 1, j] - image[i - 1, j]
+    across = image[i, j + 1] - image[i, j - 1]
+    down = image[i + 1, j] - image[i - 1, j]
     return j - x, i - y, np.hypot(across, down), np.arctan2(down, across)
 
 
@@ -94,7 +94,8 @@ def find_orientations(image, x, y, sigma):
     bins = np.rint(angle / math.tau * number).astype(int) % number
     raw = np.bincount(bins, weight, number)
     smooth = sum(w * np.roll(raw, k) for k, w in zip(range(-2, 3), (1, 4, 6, 4, 1), strict=True))
-    before, after = np.roll(smooth, 1), np.roll(smooth, -1)
+    before = np.roll(smooth, 1)
+    after = np.roll(smooth, -1)
     is_peak = (smooth > before) & (smooth > after) & (smooth >= sift.SECOND_PEAK * smooth.max())
     before, own, after = (values[is_peak] for values in (before, smooth, after))
     peaks = np.flatnonzero(is_peak) + (before - after) / (before - 2.0 * own + after) / 2.0

@@ -338,7 +338,8 @@ def begin_octave(image: Bytes) -> Array32:
 
 def follow_octave(larger: Array32) -> Array32:
     """Make the next octave (6, h / 2, w / 2) of one (6, h, w); only its first picture is written."""
-    height, width = larger.shape[1] // 2, larger.shape[2] // 2
+    height = larger.shape[1] // 2
+    width = larger.shape[2] // 2
     images = np.empty((NUM_IMAGES, height, width), np.float32)
     images[0] = larger[NUM_LAYERS, : 2 * height : 2, : 2 * width : 2]
     return images
