@@ -1,5 +1,6 @@
 """Photos of a group that are not sure, searched where the others were taken."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -7,9 +8,20 @@ import pytest
 import rooms
 from groups import SEED, one_taken, true_places
 
-from piccolo.geometry.pose import Pose, pose_errors
+from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
+from piccolo.geometry.pose_gaussian import PoseGaussian
 from piccolo.judge.belief import make_belief
-from piccolo.judge.by_others import IS_NEARBY, believe_nearby
+from piccolo.judge.by_others import (
+    IS_AT_SPOT,
+    IS_NEARBY,
+    MISSED,
+    NearbyErrors,
+    NearbyShares,
+    believe_exact,
+    believe_nearby,
+    log_odds_nearby,
+    share_nearby,
+)
 from piccolo.judge.reasons import Reason
 from piccolo.judge.result import nothing_found
 from piccolo.judge.result_parts import Alternative
@@ -34,9 +46,32 @@ def test_a_place_is_as_much_likelier_as_less_of_the_scan_is_within_reach():
 
 def test_others_make_no_pose_exact_of_which_the_photo_shows_little():
     """However little of the scan is within reach: a stranger has such a pose too."""
-    for own in (0.001, 0.05, 0.3):
-        assert believe_nearby(make_belief([own]), 0.0, gain=1e6).probabilities[0] < 0.85
-    assert believe_nearby(make_belief([0.8]), 0.0, gain=1e6).probabilities[0] > 0.9
+    elsewhere = NearbyShares(0.0, 0.01)
+    errors = NearbyErrors(1.0, 1.0, 1.0)
+    for odds in (0.001, 0.05, 0.4):
+        assert believe_exact(elsewhere, errors, odds) < 0.85
+    assert believe_exact(elsewhere, errors, 4.0) > 0.9
+
+
+def test_at_a_spot_a_local_optimum_is_another_rotation():
+    at_spot = NearbyShares(0.7, 0.0)
+    assert believe_exact(at_spot, NearbyErrors(1.0, 0.9, 0.0), 0.0) == pytest.approx(1.0 - 0.1 * MISSED)
+    assert believe_exact(at_spot, NearbyErrors(1.0, 0.0, 0.0), 0.0) == pytest.approx(1.0 - MISSED)
+    mixed = believe_exact(NearbyShares(0.3, 0.1), NearbyErrors(0.8, 0.8, 0.4), 1e9)
+    assert mixed == pytest.approx(0.75 * 0.8 + 0.25 * 0.4)
+
+
+def test_places_at_a_spot_are_likelier_than_elsewhere_and_together_as_likely_as_nearby():
+    near, far = share_nearby([1.0], 50), share_nearby([0.0], 50)
+    assert near.at_spot == IS_AT_SPOT
+    assert near.elsewhere == far.elsewhere == pytest.approx((IS_NEARBY - IS_AT_SPOT) / 50)
+    assert share_nearby([7.0], 50) == near, "a place holds at most what there is"
+    assert share_nearby([1.0, 0.0], 50).at_spot == pytest.approx(IS_AT_SPOT / 2.0), "of two spots"
+    assert log_odds_nearby(near, 50) > math.log(40.0)
+    assert log_odds_nearby(far, 50) == pytest.approx(math.log((IS_NEARBY - IS_AT_SPOT) / IS_NEARBY))
+    unknown = share_nearby([], 50)
+    assert log_odds_nearby(unknown, 50) == pytest.approx(0.0), "without a spot all places are alike"
+    assert unknown.of_spot == 0.0
 
 
 def test_a_photo_that_may_be_elsewhere_and_one_that_is_ruled_out_stay_so():
@@ -76,11 +111,17 @@ def test_only_what_is_within_reach_of_a_pose_is_searched():
     assert _nearby(far, nothing_found()) is None
 
 
+def _measure(poses, std=0.01):
+    """Poses in the map, as sure photos tell them."""
+    errors = np.diag(np.repeat([1e-4, std**2], 3))
+    return [PoseGaussian(pose, errors, np.zeros((6, 6))) for pose in poses]
+
+
 def _nearby(located, alone, min_confidence=0.9):
     scan_map = rooms.scan_map(SEED)
     shot = Shot(one_taken(1)[0], replace(rooms.KNOWN, min_confidence=min_confidence))
     means = Means(rooms.KNOWN.effort, rooms.WORKERS, Stopwatch())
-    return localize_nearby(scan_map, shot, alone, located, means)
+    return localize_nearby(scan_map, shot, alone, _measure(located), means)
 
 
 def test_a_photo_is_found_where_the_others_were_taken():
@@ -91,3 +132,30 @@ def test_a_photo_is_found_where_the_others_were_taken():
     assert distance < 0.1
     assert np.degrees(angle) < 2.0
     assert found.status == "localized"
+
+
+def test_photos_of_one_spot_tell_where_another_was_taken():
+    """Two photos tell that it is near them; four tell where, and that alone makes a doubtful photo sure."""
+    scan_map = rooms.scan_map(SEED)
+    true_pose = scan_map.from_world(one_taken(1)[1])
+    rng = np.random.default_rng(6)
+    turns = [yaw_rotation(turn) for turn in (0.9, 2.1, 3.2, 4.4)]
+    around = [
+        Pose(R @ true_pose.R_cam_from_world, true_pose.center_world + rng.normal(0.0, 0.01, 3)) for R in turns
+    ]
+    by_two, by_four = (_nearby(around[:count], nothing_found(), 0.05) for count in (2, 4))
+    assert by_four.confidence > by_two.confidence
+    assert by_four.confidence > 0.9
+    assert by_four.gaussian.largest_std < by_two.gaussian.largest_std
+    rooms.assert_near(by_four.gaussian.pose, true_pose, 0.04, 2.0)
+
+
+def test_a_spot_elsewhere_in_the_room_moves_no_photo_there():
+    """Others were taken half a metre beside: the photo is not sure to be there, and does not follow them."""
+    scan_map = rooms.scan_map(SEED)
+    true_pose = scan_map.from_world(one_taken(1)[1])
+    beside = true_pose.center_world + np.array([0.5, 0.3, 0.0])
+    turns = [yaw_rotation(turn) for turn in (0.9, 2.1, 3.2, 4.4)]
+    around = [Pose(R @ true_pose.R_cam_from_world, beside) for R in turns]
+    found = _nearby(around, nothing_found(), 0.05)
+    assert found is None or found.gaussian.pose.distance(true_pose) < 0.15 or found.confidence < 0.5

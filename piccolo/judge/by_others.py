@@ -13,6 +13,7 @@ from .belief import Belief, make_belief
 LEAST_NONE = 1e-6
 MISSED = 0.25  # chosen: share of photos without a right pose found (a sixth of BENCHMARK.md's phone photos)
 IS_NEARBY = 0.8  # chosen: probability that a photo of a group was taken within reach of the others
+IS_AT_SPOT = 0.7  # chosen: probability that it was taken where somebody stands who took the others
 LOCAL_ERRORS = np.diag(np.repeat([math.radians(2.0) ** 2, 0.15**2], 3))  # chosen: of local optima, [rad, m]
 
 
@@ -63,14 +64,59 @@ def believe_nearby(near: Belief, elsewhere: float, gain: float) -> Belief:
 
     `near` is the belief by the photo alone, as if the whole scan had been searched, which is `gain` times as
     large as the part near the others. `elsewhere` are the odds of its places if it was not taken with them.
-    The others give the place, but do not exclude local optima there: without evidence of its own, no photo is
-    exact.
     """
     odds = np.array(near.place[:-1]) / max(near.place[-1], LEAST_NONE)
     here = IS_NEARBY * gain * odds
     rest = 1.0 + (1.0 - IS_NEARBY) * elsewhere
-    within = near.within * (1.0 - local_share(float(odds[0])))
-    return replace(make_belief(here / (here.sum() + rest), within, near.doubt), ruled_out=near.ruled_out)
+    belief = make_belief(here / (here.sum() + rest), near.within, near.doubt)
+    return replace(belief, ruled_out=near.ruled_out)
+
+
+class NearbyShares(NamedTuple):
+    """Prior probabilities that a photo was taken in one place of the scan, by photos that are sure."""
+
+    at_spot: float  # where somebody stands who took them
+    elsewhere: float  # elsewhere within reach of them
+
+    @property
+    def of_spot(self) -> float:
+        """Probability that a photo that was taken in this place was taken at the spot."""
+        return self.at_spot / (self.at_spot + self.elsewhere)
+
+
+def share_nearby(at_spots: Sequence[float], num_near: int) -> NearbyShares:
+    """Return the prior probabilities of one of `num_near` places that are within reach.
+
+    `at_spots` are the probabilities, at most 1, that a photo taken at each of the known spots is in this
+    place.
+    """
+    of_spots = IS_AT_SPOT if at_spots else 0.0
+    at_spot = of_spots * sum(min(one, 1.0) for one in at_spots) / max(len(at_spots), 1)
+    return NearbyShares(at_spot, (IS_NEARBY - of_spots) / num_near)
+
+
+def log_odds_nearby(shares: NearbyShares, num_near: int) -> float:
+    """Return the logarithm of a place's odds by the spots, against that of any of the places within reach."""
+    return math.log((shares.at_spot + shares.elsewhere) * num_near / IS_NEARBY)
+
+
+class NearbyErrors(NamedTuple):
+    """Probabilities that a photo's pose near others is exact enough, by what it rests on."""
+
+    at_spot: float  # it was taken at the spot, and fits best there
+    missed: float  # it was taken at the spot, and fits best elsewhere there
+    alone: float  # it was taken elsewhere
+
+
+def believe_exact(shares: NearbyShares, errors: NearbyErrors, odds: float) -> float:
+    """Return the probability that a photo's pose near others is exact enough, by the odds of its place.
+
+    The others give the place, but do not exclude local optima there: without evidence of its own, no photo
+    is exact. At a known spot a local optimum is another rotation.
+    """
+    local = local_share(odds)
+    here = (1.0 - local) * errors.at_spot + local * errors.missed
+    return shares.of_spot * here + (1.0 - shares.of_spot) * (1.0 - local) * errors.alone
 
 
 def believe_beside(alone: Belief, confidences: Sequence[float], within: float | None) -> Belief:

@@ -77,6 +77,7 @@ class Candidate:
     score: float  # score of `comparison`
     comparison: Comparison  # of the photo and the scan as seen from the pose
     against_prior: tuple[Contradiction, ...] = ()  # prior knowledge that the pose contradicts
+    log_by_others: float = 0.0  # log odds by where other photos were taken
     num_matches: int | None = None  # features that agree with the drawn scan; None: it was not drawn
     edge_score: float | None = None  # of the scan's edges drawn at the pose, in a scan without colours
     is_climbed: bool = False  # no perturbation improves it

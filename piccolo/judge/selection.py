@@ -60,7 +60,7 @@ def assess_alone(profile: Profile, ranked: Sequence[Candidate]) -> list[Standing
     for h, wrong, count in zip(ranked, is_wrong, counts, strict=True):
         num_matches = count if profile.uses_matches else None
         drawn = None if h.edge_score is None else h.edge_score * profile.discount
-        of_prior = log_prior if wrong else 0.0
+        of_prior = h.log_by_others + (log_prior if wrong else 0.0)
         score = profile.discount * h.score
         standings.append(Standing(1.0, score, num_matches, profile.evidence, of_prior, drawn))
     return standings

@@ -103,7 +103,7 @@ def localize_rest(
     sure = {k: one.result for k, one in grouped.items() if one.result.status == LOCALIZED}
     if len(sure) < LEAST_LOCATED:
         return {}
-    located = [result.gaussian.pose for result in sure.values() if result.gaussian]
+    located = [result.gaussian for result in sure.values() if result.gaussian]
     found = {
         k: localize_nearby(scan_map, shots[k], one.result, located, means)
         for k, one in grouped.items()

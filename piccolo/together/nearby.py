@@ -1,32 +1,42 @@
 """Photos of a group that are not sure, searched once more where the others were taken.
 
 A photo of a bare wall may be anywhere in a whole scan, but fits only few places within reach of a known one.
+Where enough photos are sure, they also tell where somebody stood who took them (`spot`). Such a photo is then
+turned there until it fits best, as a bare wall fixes no position.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from ..evidence.covariance import estimate_pose_errors
+from ..evidence.examine import examine
 from ..geometry.pose import Pose
+from ..geometry.pose_gaussian import PoseGaussian
+from ..judge.belief import make_belief
 from ..judge.by_others import LEAST_NONE, believe_nearby
-from ..judge.conclude import take_pose
-from ..judge.probability import LOCALIZED
+from ..judge.probability import LOCALIZED, posterior
 from ..judge.result import Result
-from ..localization.judging import judge
+from ..judge.selection import assess, credit_copies
+from ..localization.copies import list_reported
+from ..localization.judging import Found, judge_together
 from ..localization.means import Means
 from ..localization.run import find, prepare_search
+from ..problem.accuracy import Demand
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
 from ..system.arrays import Array
+from .at_spot import Nearby, place_nearby, turn_at_spots
 from .members import Shot
-from .optima import spread_optima
+from .spot import find_spots
 
 REACH = 1.0  # chosen: [m] from the nearest photo of those that were taken together
 
 
 def localize_nearby(
-    scan_map: ScanMap, shot: Shot, alone: Result, located: Sequence[Pose], means: Means
+    scan_map: ScanMap, shot: Shot, alone: Result, located: Sequence[PoseGaussian], means: Means
 ) -> Result | None:
     """Return the result of a photo within reach of others, whose poses in the map are known.
 
@@ -36,26 +46,43 @@ def localize_nearby(
     whole = prepare_search(scan_map, shot.panorama, shot.settings, means.watch)
     if whole is None:
         return None
-    near = narrow_around(whole.scan_map, located)
+    poses = [one.pose for one in located]
+    near = narrow_around(whole.scan_map, poses)
     if len(near.sparse) == 0:
         return None
     problem = replace(whole, scan_map=near)
-    demand = shot.settings.demand
     searched = find(problem, scan_map, means)
-    found = judge(searched, means, demand, may_promote=False)
-    if found.best_pose is None or found.gaussian is None:
+    if searched.selection.best.score < 0.0:
         return None
-    elsewhere = compute_odds_elsewhere(scan_map, alone, located)
-    belief = believe_nearby(found.belief, elsewhere, len(whole.scan_map.sparse) / len(near.sparse))
-    result = found.take_belief(belief, demand.min_confidence)
-    if result.status != LOCALIZED:
+    nearby = Nearby(find_spots(located), len(near.sparse))
+    found = turn_at_spots(searched, nearby, means.workers)
+    elsewhere = compute_odds_elsewhere(scan_map, alone, poses)
+    gain = len(whole.scan_map.sparse) / len(near.sparse)
+    result = judge_nearby(found, nearby, elsewhere, gain, means, shot.settings.demand)
+    return result if result and result.status == LOCALIZED else None
+
+
+def judge_nearby(
+    found: Found, nearby: Nearby, elsewhere: float, gain: float, means: Means, demand: Demand
+) -> Result | None:
+    """Return the result of a photo for the best of its poses near others; None if nothing fixes it."""
+    problem, selection, fit = found
+    workers = means.workers
+    best = selection.best
+    errors = estimate_pose_errors(problem, best, workers)
+    errors = errors.widen(fit.pose_covariance) if fit else errors
+    reported, is_copy = list_reported(problem, selection, means.effort, workers)
+    standings = credit_copies(assess(problem.profile, reported), is_copy)
+    near = make_belief(posterior(standings, errors.std_of_fit, problem.method)[:-1])
+    belief = believe_nearby(near, elsewhere, gain)
+    odds = near.place[0] / max(near.place[-1], LEAST_NONE) / math.exp(best.log_by_others)
+    placed = place_nearby(problem, best, errors.gaussian, nearby, odds, demand.accuracy, workers)
+    if placed is None:
         return None
-    best = searched.selection.best
-    widened = found.gaussian.blur(spread_optima(searched.problem, best, found.gaussian, means.workers))
-    share = demand.accuracy.probability(widened) / demand.accuracy.probability(found.gaussian)
-    belief = replace(belief, within=share * belief.within)
-    result = take_pose(result, widened, scan_map).take_belief(belief, demand.min_confidence)
-    return result if result.status == LOCALIZED else None
+    there = examine(problem, placed.gaussian.pose)
+    at_pose = Found(problem, reported.take([there, *reported.alternatives]), fit)
+    believed = replace(belief, within=placed.within)
+    return judge_together(at_pose, placed.gaussian, believed, means, demand.min_confidence)
 
 
 def compute_odds_elsewhere(scan_map: ScanMap, alone: Result, located: Sequence[Pose]) -> float:

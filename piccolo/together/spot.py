@@ -1,0 +1,101 @@
+"""Where somebody stands who takes photos around: from photos that are sure follows where others were taken.
+
+A person turns about their own axis and holds the camera before them, as far out as an arm reaches. So a
+photo's position is that of the axis, and an offset that turns with the camera. Axis, offset and how steadily
+both are kept are estimated from the photos that are sure; an offset of zero is a turn on the spot, and an
+unsteady one are a few steps. Bayesian linear regression, averaged over the deviations that may remain
+(Bishop, Pattern Recognition and Machine Learning, 2006, section 3.5).
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..geometry.pose_gaussian import PoseGaussian
+from ..system.arrays import Array
+
+LEAST_AT_SPOT = 3  # photos by which it is told how steadily somebody stands
+STEPS_APART = 1.0  # chosen: [m] from a photo to the nearest other that was taken at the same spot
+ARM = 0.4  # chosen: [m] deviation of the offset along each axis of the camera
+STEADINESSES = (0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28)  # [m] deviations that may remain, each as likely
+FREE = 1e3  # [m] deviation of the axis's position before any photo
+
+
+class Positioned(NamedTuple):
+    """A position in the map, and the covariance (3, 3) [m^2] of its error."""
+
+    center: Array  # (3,) [m]
+    covariance: Array
+
+
+class Spot(NamedTuple):
+    """Where somebody stands: for each deviation that may remain, its probability, and axis and offset."""
+
+    probabilities: Array  # (S,)
+    means: Array  # (S, 6) [m] the axis's position in the map, and the camera's offset along its axes
+    covariances: Array  # (S, 6, 6) [m^2]
+
+    def place(self, R_cam_from_map: Array) -> Positioned:
+        """Return where a camera with a rotation (3, 3) is expected."""
+        A = differentiate_position(R_cam_from_map)
+        centers = self.means @ A.T
+        center = self.probabilities @ centers
+        apart = centers - center
+        within = A @ self.covariances @ A.T + np.square(STEADINESSES)[:, None, None] * np.eye(3)
+        every = within + apart[:, :, None] * apart[:, None]
+        return Positioned(center, np.tensordot(self.probabilities, every, 1))
+
+
+def differentiate_position(R_cam_from_map: Array) -> Array:
+    """Return the derivative (3, 6) of a camera's position by the axis's position and the camera's offset."""
+    return np.concatenate([np.eye(3), R_cam_from_map.T], axis=1)
+
+
+def find_spots(located: Sequence[PoseGaussian]) -> list[Spot]:
+    """Find the spots where enough photos were taken, whose poses in the map are known."""
+    spots = []
+    left = list(located)
+    while left:
+        near = [left.pop(0)]
+        for one in near:
+            near += [other for other in left if one.pose.distance(other.pose) <= STEPS_APART]
+            left = [other for other in left if one.pose.distance(other.pose) > STEPS_APART]
+        if len(near) >= LEAST_AT_SPOT:
+            spots.append(fit_spot(near))
+    return spots
+
+
+def fit_spot(located: Sequence[PoseGaussian]) -> Spot:
+    """Estimate axis and offset of somebody who took photos, from their poses in the map."""
+    origin = located[0].pose.center_world
+    centers = np.array([one.pose.center_world for one in located]) - origin
+    A = np.array([differentiate_position(one.pose.R_cam_from_world) for one in located])
+    errors = np.array([one.own[3:, 3:] for one in located])
+    known = np.diag(np.repeat([FREE**-2, ARM**-2], 3))
+    logs = []
+    means = []
+    covariances = []
+    for steadiness in STEADINESSES:
+        variances = errors + steadiness**2 * np.eye(3)
+        weights = np.linalg.inv(variances)
+        weighted = A.transpose(0, 2, 1) @ weights
+        information = known + (weighted @ A).sum(axis=0)
+        total = (weighted @ centers[..., None]).sum(axis=0)[:, 0]
+        mean = np.linalg.solve(information, total)
+        misfit = np.einsum("ki,kij,kj->", centers, weights, centers) - total @ mean
+        volumes = np.linalg.slogdet(variances)[1].sum() + np.linalg.slogdet(information)[1]
+        logs.append(-0.5 * (misfit + volumes))
+        means.append(np.concatenate([mean[:3] + origin, mean[3:]]))
+        covariances.append(np.linalg.inv(information))
+    likelihoods = np.exp(np.array(logs) - max(logs))
+    return Spot(likelihoods / likelihoods.sum(), np.array(means), np.array(covariances))
+
+
+def compute_density(position: Positioned, center: Array) -> float:
+    """Return the probability density [1/m^3] of a position (3,)."""
+    offset = center - position.center
+    square = float(offset @ np.linalg.solve(position.covariance, offset))
+    volume = math.sqrt(math.tau**3 * float(np.linalg.det(position.covariance)))
+    return math.exp(-0.5 * square) / volume
