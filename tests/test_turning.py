@@ -9,10 +9,9 @@ import rooms
 
 from piccolo.evidence.blocks import fill_symmetric
 from piccolo.evidence.covariance import make_problem
-from piccolo.evidence.examine import examine
-from piccolo.evidence.turning import estimate_turn, turn, turn_equations
 from piccolo.geometry.levenberg_marquardt import GRADIENT, LOSS, MATRIX, NUM_SUMS
 from piccolo.geometry.pose import Pose, angle_between, exp_so3
+from piccolo.localization.turning import turn, turn_equations
 from piccolo.optimize.channel_loss import channel_equations
 
 TIER = "scene"
@@ -55,28 +54,3 @@ def test_a_photo_turns_to_where_it_fits_and_stays_where_it_is(off_deg):
     angle = math.degrees(angle_between(end.R_cam_from_world, true_pose.R_cam_from_world))
     assert angle < 0.3
     np.testing.assert_array_equal(end.center_world, true_pose.center_world)
-
-
-def test_a_rotation_makes_up_for_an_error_of_the_position():
-    """The covariance tells how far, and which way: turned 5 cm beside, the photo is turned as it says."""
-    problem, true_pose = _narrow()
-    errors = 0.05**2 * np.eye(3)
-    here = turn(problem, true_pose)
-    found = estimate_turn(problem, examine(problem, here), errors)
-    assert found is not None
-    np.testing.assert_allclose(found.own[3:, 3:], errors, rtol=1e-6, atol=1e-12)
-    slope = found.own[:3, 3:] @ np.linalg.inv(errors)  # of the rotation by the position
-    tight = estimate_turn(problem, examine(problem, here), 1e-8 * np.eye(3))
-    assert np.trace(tight.own[:3, :3]) < np.trace(found.own[:3, :3])
-    across = true_pose.R_cam_from_world.T @ np.array([0.0, 0.05, 0.0])
-    beside = turn(problem, Pose(here.R_cam_from_world, here.center_world + across))
-    turned = angle_between(beside.R_cam_from_world, here.R_cam_from_world)
-    assert turned == pytest.approx(np.linalg.norm(slope @ across), rel=0.5)
-
-
-def test_a_grey_photo_fixes_no_rotation():
-    problem, true_pose = _narrow()
-    blank = rooms.as_panorama(np.full((256, 512, 3), 127, np.uint8))
-    grey = rooms.ask(blank, problem.scan_map)
-    assert estimate_turn(problem, examine(problem, true_pose), np.eye(3)) is not None
-    assert estimate_turn(grey, examine(grey, true_pose), np.eye(3)) is None

@@ -103,20 +103,23 @@ def log_odds_nearby(shares: NearbyShares, num_near: int) -> float:
 class NearbyErrors(NamedTuple):
     """Probabilities that a photo's pose near others is exact enough, by what it rests on."""
 
-    at_spot: float  # it was taken at the spot, and fits best there
-    missed: float  # it was taken at the spot, and fits best elsewhere there
+    at_spot: float  # it was taken at the spot, and its own pose is right
+    missed: float  # it was taken at the spot, and its own pose is a local optimum there
     alone: float  # it was taken elsewhere
+    likelihood_ratio: float = 1.0  # of a right pose against a local optimum, by its distance from the spot
 
 
 def believe_exact(shares: NearbyShares, errors: NearbyErrors, odds: float) -> float:
     """Return the probability that a photo's pose near others is exact enough, by the odds of its place.
 
     The others give the place, but do not exclude local optima there: without evidence of its own, no photo
-    is exact. At a known spot a local optimum is another rotation.
+    is exact. At a known spot they tell the position of a local optimum too.
     """
     local = local_share(odds)
-    here = (1.0 - local) * errors.at_spot + local * errors.missed
-    return shares.of_spot * here + (1.0 - shares.of_spot) * (1.0 - local) * errors.alone
+    own = Shares(1.0 - local, local)
+    at_spot = own.weigh_own(errors.likelihood_ratio)
+    here = at_spot.right * errors.at_spot + at_spot.missed * errors.missed
+    return shares.of_spot * here + (1.0 - shares.of_spot) * own.right * errors.alone
 
 
 def believe_beside(alone: Belief, confidences: Sequence[float], within: float | None) -> Belief:

@@ -1,92 +1,129 @@
-"""Poses of a photo at a spot where others were taken: turned there until it fits best, and weighed by it."""
+"""Poses of a photo at a spot where others were taken: averaged with the spot, or turned there until they fit.
+
+A photo that fixes its own position is averaged with the spot, unless both contradict each other: then it was
+taken elsewhere. One of a bare wall fixes no position. It has that of the spot, if it fits there as well as
+where it fits best.
+"""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from ..evidence.covariance import estimate_pose_errors
 from ..evidence.examine import choose, examine
-from ..evidence.turning import estimate_turn, turn
+from ..evidence.loose_covariance import estimate_loosely
 from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LIKELY, PoseGaussian
-from ..judge.alternatives import sort_by_score, suppress_near
-from ..judge.by_others import (
-    LOCAL_ERRORS,
-    NearbyErrors,
-    NearbyShares,
-    believe_exact,
-    log_odds_nearby,
-    share_nearby,
-)
+from ..judge.alternatives import suppress_near
+from ..judge.by_others import LOCAL_ERRORS, NearbyErrors, NearbyShares, log_odds_nearby, share_nearby
 from ..judge.candidate import Candidate, Selection
 from ..judge.probability import log_odds
 from ..judge.selection import assess
 from ..localization.judging import Found
+from ..localization.ladder import refine
+from ..localization.turning import turn
 from ..problem.accuracy import Accuracy
 from ..problem.problem import Problem
+from ..problem.stages import FULL
 from ..scan_map.camera_positions import COARSE_SPACING
+from ..system.arrays import Array
 from ..system.jobs.threads import Workers
+from .bundle import compare_errors
 from .optima import spread_optima
 from .spot import Positioned, Spot, compute_density
 
-NUM_TURNED = 4  # poses of a photo whose rotations are tried at a spot
+NUM_HELD = 4  # poses of a photo that are held at a spot
+LEAST_HELD = 0.7  # chosen: their score, divided by the best one's
+FITS_THERE = 0.9  # chosen: score of a pose that was turned at a spot, divided by that of where it fits best
 ROUNDS_AT_SPOT = 2  # of a turn: the position follows the rotation
 CELL_VOLUME = COARSE_SPACING**3  # [m^3] of a place of the scan
 LOOSE_TURN = 1.0  # [rad] deviation of a rotation that others do not tell
-OF_POSITION = slice(3, 6)  # in a step
-LOCAL_TURN = np.diag([*np.diag(LOCAL_ERRORS)[:3], 0.0, 0.0, 0.0])  # errors (6, 6) of local optima at a spot
+OF_TURN = slice(0, 3)  # of a step
+OF_MOVE = slice(3, 6)
+LOCAL_MOVES = LOCAL_ERRORS[OF_MOVE, OF_MOVE]  # (3, 3) [m^2]
+NOTHING_COMMON = np.zeros((6, 6))
 
 
-class Nearby(NamedTuple):
+class Held(NamedTuple):
+    """A pose of a photo near others, and what it rests on."""
+
+    candidate: Candidate  # with the odds of its place by the others
+    gaussian: PoseGaussian | None  # in the map; None where nothing fixes the pose
+    shares: NearbyShares  # of its place
+    exact: NearbyErrors
+    std_of_fit: float | None  # by the photo alone: as `Errors` has it
+
+
+@dataclass(frozen=True)
+class Nearby:
     """Where a photo may have been taken, by those that are sure."""
 
     spots: Sequence[Spot]
     num_near: int  # places of the scan within reach of them
+    accuracy: Accuracy
 
-    def share(self, pose: Pose) -> NearbyShares:
-        """Return the prior probabilities of a pose's place."""
-        densities = [compute_density(self.blur(spot, pose), pose.center_world) for spot in self.spots]
+    def find_likeliest(self, pose: Pose) -> Spot | None:
+        """Return the spot at which a photo with a pose was taken likeliest; None if no spot is known."""
+
+        def compute(spot: Spot) -> float:
+            return compute_density(blur(spot, pose, LOCAL_MOVES), pose.center_world)
+
+        return max(self.spots, key=compute, default=None)
+
+    def weigh(self, candidate: Candidate, shares: NearbyShares) -> Candidate:
+        """Return a candidate with the odds of its place."""
+        return replace(candidate, log_by_others=log_odds_nearby(shares, self.num_near))
+
+    def take_elsewhere(
+        self, candidate: Candidate, alone: PoseGaussian | None = None, std_of_fit: float | None = None
+    ) -> Held:
+        """Return a pose that is not at a spot."""
+        shares = share_nearby([0.0] * len(self.spots), self.num_near)
+        within = 0.0 if alone is None else self.accuracy.probability(alone)
+        exact = NearbyErrors(0.0, 0.0, within)
+        return Held(self.weigh(candidate, shares), alone, shares, exact, std_of_fit)
+
+    def average(
+        self, candidate: Candidate, alone: PoseGaussian, spot: Spot, std_of_fit: float | None
+    ) -> Held | None:
+        """Return the mean of a pose by the photo alone and of a spot; None if both contradict each other."""
+        pose = alone.pose
+        center, covariance = spot.place(pose.R_cam_from_world)
+        there = PoseGaussian(Pose(pose.R_cam_from_world, center), loosen(covariance), NOTHING_COMMON)
+        if alone.square_distance(there) > LIKELY:
+            return None
+        fused = alone.fuse(there)
+        shares = self.share(pose, alone.covariance[OF_MOVE, OF_MOVE])
+        missed = there.own.copy()
+        missed[OF_TURN, OF_TURN] = alone.covariance[OF_TURN, OF_TURN] + LOCAL_ERRORS[OF_TURN, OF_TURN]
+        exact = NearbyErrors(
+            self.accuracy.probability(fused),
+            self.accuracy.probability_at(fused.pose, replace(there, own=missed)),
+            self.accuracy.probability_at(fused.pose, alone),
+            compare_errors(there, alone),
+        )
+        return Held(self.weigh(candidate, shares), fused, shares, exact, std_of_fit)
+
+    def share(self, pose: Pose, errors: Array) -> NearbyShares:
+        """Return the prior probabilities of the place of a pose whose position has errors (3, 3) [m^2]."""
+        densities = [compute_density(blur(spot, pose, errors), pose.center_world) for spot in self.spots]
         return share_nearby([CELL_VOLUME * density for density in densities], self.num_near)
 
-    def blur(self, spot: Spot, pose: Pose) -> Positioned:
-        """Return where a photo is expected at a spot, with the errors of local optima."""
-        center, covariance = spot.place(pose.R_cam_from_world)
-        return Positioned(center, covariance + LOCAL_ERRORS[OF_POSITION, OF_POSITION])
 
-    def find_likeliest(self, pose: Pose) -> Spot:
-        """Return the spot at which a photo with a pose was taken likeliest."""
-        return max(self.spots, key=lambda spot: compute_density(self.blur(spot, pose), pose.center_world))
-
-    def is_turned(self, pose: Pose) -> bool:
-        """Return True if a pose is exactly where a spot expects it."""
-        places = [spot.place(pose.R_cam_from_world).center for spot in self.spots]
-        return any(np.array_equal(place, pose.center_world) for place in places)
-
-    def weigh(self, candidate: Candidate) -> Candidate:
-        """Return a candidate with the odds of its place by the sure photos."""
-        return replace(candidate, log_by_others=log_odds_nearby(self.share(candidate.pose), self.num_near))
+def blur(spot: Spot, pose: Pose, errors: Array) -> Positioned:
+    """Return where a photo with the rotation of a pose is expected at a spot, with further errors (3, 3)."""
+    center, covariance = spot.place(pose.R_cam_from_world)
+    return Positioned(center, covariance + errors)
 
 
-def turn_at_spots(found: Found, nearby: Nearby, workers: Workers) -> Found:
-    """Return the poses found for a photo, and what they become at a spot, chosen by where others are too."""
-    problem = found.problem
-    turned = [
-        examine(problem, turn_at(problem, candidate.pose, spot))
-        for candidate in found.selection.candidates[:NUM_TURNED]
-        for spot in nearby.spots
-    ]
-    every = sort_by_score(list(map(nearby.weigh, (*found.selection.candidates, *turned))))
-    standings = assess(problem.profile, Selection(every[0], tuple(every[1:])))
-    order = np.argsort([-log_odds(standing, problem.method) for standing in standings], kind="stable")
-    best, *others = suppress_near([every[k] for k in order], len(every), ONE_ANSWER)
-    return found._replace(selection=choose(problem, Selection(best, tuple(others)), workers))
-
-
-def move_to(spot: Spot, pose: Pose) -> Pose:
-    """Return a pose with the same rotation at a spot."""
-    return Pose(pose.R_cam_from_world, spot.place(pose.R_cam_from_world).center)
+def loosen(position: Array) -> Array:
+    """Return the covariance (6, 6) of a pose whose position alone is known, with a covariance (3, 3)."""
+    covariance = LOOSE_TURN**2 * np.eye(6)
+    covariance[OF_MOVE, OF_MOVE] = position
+    return covariance
 
 
 def turn_at(problem: Problem, pose: Pose, spot: Spot) -> Pose:
@@ -96,62 +133,49 @@ def turn_at(problem: Problem, pose: Pose, spot: Spot) -> Pose:
     return move_to(spot, pose)
 
 
-class Placed(NamedTuple):
-    """The pose of a photo near others, and the probability that it is exact enough if its place is right."""
-
-    gaussian: PoseGaussian  # in the map
-    within: float
+def move_to(spot: Spot, pose: Pose) -> Pose:
+    """Return a pose with the same rotation at a spot."""
+    return Pose(pose.R_cam_from_world, spot.place(pose.R_cam_from_world).center)
 
 
-def place_nearby(
-    problem: Problem,
-    best: Candidate,
-    own: PoseGaussian | None,
-    nearby: Nearby,
-    odds: float,
-    accuracy: Accuracy,
-    workers: Workers,
-) -> Placed | None:
-    """Return the pose of a photo near others; None if nothing fixes it.
-
-    `own` is the pose by the photo alone, and `odds` are those of its place. At a spot it is averaged with the
-    position there. If the photo does not fix its position, or was turned there, the spot does.
-    """
-    shares = nearby.share(best.pose)
-    if nearby.is_turned(best.pose):  # the covariance by the photo alone holds where it fits best
-        own = None
-    if own is not None:
-        own = own.blur(spread_optima(problem, best, own, workers))
-    expected = expect_at_spot(problem, best, nearby) if shares.at_spot > shares.elsewhere else None
-    if expected is None:
-        return None if own is None else place_elsewhere(own, odds, accuracy)
-    gaussian = own and hold_position(nearby.find_likeliest(best.pose), own)
-    gaussian = gaussian or expected
-    errors = NearbyErrors(
-        accuracy.probability(gaussian),
-        accuracy.probability_at(gaussian.pose, expected.blur(LOCAL_TURN)),
-        0.0 if own is None else accuracy.probability_at(gaussian.pose, own),
-    )
-    return Placed(gaussian, believe_exact(shares, errors, odds))
+def hold_at_spots(found: Found, nearby: Nearby, workers: Workers) -> tuple[Found, Held]:
+    """Return the poses found for a photo, chosen by where others were taken too, and the best of them."""
+    problem = found.problem
+    candidates = found.selection.candidates
+    least = LEAST_HELD * found.selection.best.score
+    asked = [one for one in candidates[:NUM_HELD] if one.score >= least]
+    every = [hold(found, one, nearby, workers) for one in asked]
+    every += [nearby.take_elsewhere(one) for one in candidates if not any(one is other for other in asked)]
+    standings = assess(problem.profile, Selection(every[0].candidate, tuple(h.candidate for h in every[1:])))
+    order = np.argsort([-log_odds(standing, problem.method) for standing in standings], kind="stable")
+    best, *others = suppress_near([every[k].candidate for k in order], len(every), ONE_ANSWER)
+    chosen = choose(problem, Selection(best, tuple(others)), workers)
+    held = next(one for one in every if one.candidate.pose is chosen.best.pose)
+    return found._replace(selection=chosen), held
 
 
-def place_elsewhere(own: PoseGaussian, odds: float, accuracy: Accuracy) -> Placed:
-    """Return the pose of a photo near others that was not taken at one of their spots."""
-    errors = NearbyErrors(0.0, 0.0, accuracy.probability(own))
-    return Placed(own, believe_exact(NearbyShares(0.0, 1.0), errors, odds))
+def hold(found: Found, candidate: Candidate, nearby: Nearby, workers: Workers) -> Held:
+    """Return a pose at the likeliest spot, or as taken elsewhere if the photo contradicts that."""
+    problem = found.problem
+    errors = estimate_pose_errors(problem, candidate, workers)
+    errors = errors.widen(found.fit.pose_covariance) if found.fit else errors
+    alone = errors.gaussian
+    spot = nearby.find_likeliest(candidate.pose)
+    if alone is None:
+        turned = spot and hold_turned(problem, candidate, spot, nearby, workers)
+        return turned or nearby.take_elsewhere(candidate)
+    alone = alone.blur(spread_optima(problem, candidate, alone, workers))
+    averaged = spot and nearby.average(candidate, alone, spot, errors.std_of_fit)
+    return averaged or nearby.take_elsewhere(candidate, alone, errors.std_of_fit)
 
 
-def expect_at_spot(problem: Problem, best: Candidate, nearby: Nearby) -> PoseGaussian | None:
-    """Return the pose of a photo turned at the spot that is likeliest for it; None if nothing fixes it."""
-    spot = nearby.find_likeliest(best.pose)
-    turned = best if nearby.is_turned(best.pose) else examine(problem, turn_at(problem, best.pose, spot))
-    return estimate_turn(problem, turned, spot.place(turned.pose.R_cam_from_world).covariance)
-
-
-def hold_position(spot: Spot, own: PoseGaussian) -> PoseGaussian | None:
-    """Return the mean of a photo's own pose and where a spot expects it; None if these contradict."""
-    center, covariance = spot.place(own.pose.R_cam_from_world)
-    errors = np.diag(np.repeat([LOOSE_TURN**2, 0.0], 3))
-    errors[OF_POSITION, OF_POSITION] = covariance
-    there = PoseGaussian(Pose(own.pose.R_cam_from_world, center), errors, np.zeros((6, 6)))
-    return own.fuse(there) if own.square_distance(there) <= LIKELY else None
+def hold_turned(
+    problem: Problem, candidate: Candidate, spot: Spot, nearby: Nearby, workers: Workers
+) -> Held | None:
+    """Return the pose of a photo that does not fix it, at a spot; None if it does not fit there."""
+    start = turn_at(problem, candidate.pose, spot)
+    turned = examine(problem, refine(problem, start, workers, FULL).pose)
+    alone = estimate_loosely(problem, turned)
+    if alone is None or turned.score < FITS_THERE * candidate.score:
+        return None
+    return nearby.average(turned, alone, spot, None)

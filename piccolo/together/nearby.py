@@ -1,8 +1,7 @@
 """Photos of a group that are not sure, searched once more where the others were taken.
 
 A photo of a bare wall may be anywhere in a whole scan, but fits only few places within reach of a known one.
-Where enough photos are sure, they also tell where somebody stood who took them (`spot`). Such a photo is then
-turned there until it fits best, as a bare wall fixes no position.
+Where enough photos are sure, they also tell where somebody stands who took them (`at_spot`).
 """
 
 import math
@@ -11,13 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..evidence.covariance import estimate_pose_errors
 from ..evidence.examine import examine
+from ..evidence.focal_length import FocalFit
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
 from ..judge.belief import make_belief
-from ..judge.by_others import LEAST_NONE, believe_nearby
-from ..judge.probability import LOCALIZED, posterior
+from ..judge.by_others import LEAST_NONE, believe_exact, believe_nearby
+from ..judge.probability import posterior
 from ..judge.result import Result
 from ..judge.selection import assess, credit_copies
 from ..localization.copies import list_reported
@@ -28,7 +27,8 @@ from ..problem.accuracy import Demand
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
 from ..system.arrays import Array
-from .at_spot import Nearby, place_nearby, turn_at_spots
+from .at_spot import Held, Nearby, hold_at_spots
+from .bundle import EVEN_ODDS
 from .members import Shot
 from .spot import find_spots
 
@@ -36,12 +36,17 @@ REACH = 1.0  # chosen: [m] from the nearest photo of those that were taken toget
 
 
 def localize_nearby(
-    scan_map: ScanMap, shot: Shot, alone: Result, located: Sequence[PoseGaussian], means: Means
+    scan_map: ScanMap,
+    shot: Shot,
+    alone: Result,
+    located: Sequence[PoseGaussian],
+    is_calibrated: bool,
+    means: Means,
 ) -> Result | None:
     """Return the result of a photo within reach of others, whose poses in the map are known.
 
-    None if there is no candidate place, or if the photo is not sure there either, as where the points do not
-    fix its pose.
+    `is_calibrated` says that enough sure photos of the same camera agree with what is given of it. None if
+    there is no candidate place, or if a pose there is not likelier than not, or no surer than alone.
     """
     whole = prepare_search(scan_map, shot.panorama, shot.settings, means.watch)
     if whole is None:
@@ -52,37 +57,36 @@ def localize_nearby(
         return None
     problem = replace(whole, scan_map=near)
     searched = find(problem, scan_map, means)
+    if is_calibrated and isinstance(searched.fit, FocalFit):  # one photo does not contradict several
+        searched = searched._replace(fit=searched.fit._replace(conflict=0.0))
     if searched.selection.best.score < 0.0:
         return None
-    nearby = Nearby(find_spots(located), len(near.sparse))
-    found = turn_at_spots(searched, nearby, means.workers)
+    demand = shot.settings.demand
+    nearby = Nearby(find_spots(located), len(near.sparse), demand.accuracy)
+    found, held = hold_at_spots(searched, nearby, means.workers)
     elsewhere = compute_odds_elsewhere(scan_map, alone, poses)
     gain = len(whole.scan_map.sparse) / len(near.sparse)
-    result = judge_nearby(found, nearby, elsewhere, gain, means, shot.settings.demand)
-    return result if result and result.status == LOCALIZED else None
+    result = judge_nearby(found, held, elsewhere, gain, means, demand)
+    least = max(alone.confidence, EVEN_ODDS)
+    return result if result and result.confidence > least else None
 
 
 def judge_nearby(
-    found: Found, nearby: Nearby, elsewhere: float, gain: float, means: Means, demand: Demand
+    found: Found, held: Held, elsewhere: float, gain: float, means: Means, demand: Demand
 ) -> Result | None:
     """Return the result of a photo for the best of its poses near others; None if nothing fixes it."""
-    problem, selection, fit = found
-    workers = means.workers
-    best = selection.best
-    errors = estimate_pose_errors(problem, best, workers)
-    errors = errors.widen(fit.pose_covariance) if fit else errors
-    reported, is_copy = list_reported(problem, selection, means.effort, workers)
-    standings = credit_copies(assess(problem.profile, reported), is_copy)
-    near = make_belief(posterior(standings, errors.std_of_fit, problem.method)[:-1])
-    belief = believe_nearby(near, elsewhere, gain)
-    odds = near.place[0] / max(near.place[-1], LEAST_NONE) / math.exp(best.log_by_others)
-    placed = place_nearby(problem, best, errors.gaussian, nearby, odds, demand.accuracy, workers)
-    if placed is None:
+    if held.gaussian is None:
         return None
-    there = examine(problem, placed.gaussian.pose)
+    problem, selection, fit = found
+    reported, is_copy = list_reported(problem, selection, means.effort, means.workers)
+    standings = credit_copies(assess(problem.profile, reported), is_copy)
+    near = make_belief(posterior(standings, held.std_of_fit, problem.method)[:-1])
+    odds = near.place[0] / max(near.place[-1], LEAST_NONE) / math.exp(held.candidate.log_by_others)
+    within = believe_exact(held.shares, held.exact, odds)
+    belief = replace(believe_nearby(near, elsewhere, gain), within=within)
+    there = examine(problem, held.gaussian.pose)
     at_pose = Found(problem, reported.take([there, *reported.alternatives]), fit)
-    believed = replace(belief, within=placed.within)
-    return judge_together(at_pose, placed.gaussian, believed, means, demand.min_confidence)
+    return judge_together(at_pose, held.gaussian, belief, means, demand.min_confidence)
 
 
 def compute_odds_elsewhere(scan_map: ScanMap, alone: Result, located: Sequence[Pose]) -> float:

@@ -1,0 +1,40 @@
+"""The rotation of a photo whose position is known by other means."""
+
+import numpy as np
+
+from ..evidence.covariance import make_problem
+from ..geometry.levenberg_marquardt import GRADIENT, MATRIX, levenberg_marquardt
+from ..geometry.pose import Pose, orthonormal
+from ..optimize.channel_loss import ChannelProblem, channel_equations
+from ..problem.problem import Problem
+from ..problem.stages import FULL
+from ..system.arrays import Array
+
+OF_TURN = GRADIENT, GRADIENT + 1, GRADIENT + 2, *(MATRIX + k for k in (0, 1, 2, 6, 7, 11))
+OF_MOVE = MATRIX + 15, MATRIX + 18, MATRIX + 20  # the diagonal alone: no gradient asks for a move
+
+
+def turn_equations(
+    problem: ChannelProblem, R_cam_from_world: Array, center_world: Array, sums: Array
+) -> None:
+    """Write the sums (29,) of `channel_equations` of a camera that turns but stays where it is."""
+    channel_equations(problem, R_cam_from_world, center_world, sums)
+    turning = np.zeros_like(sums)
+    turning[:GRADIENT] = sums[:GRADIENT]
+    turning[list(OF_TURN)] = sums[list(OF_TURN)]
+    turning[list(OF_MOVE)] = 1.0
+    sums[:] = turning
+
+
+descend_turns = levenberg_marquardt(turn_equations)
+
+
+def turn(problem: Problem, pose: Pose) -> Pose:
+    """Return the pose at the same position whose rotation fits the photo best, from coarse to fine."""
+    points = problem.view_at(pose, "points").around(pose.center_world)
+    R_cam_from_map = pose.R_cam_from_world.copy()
+    limits = FULL.limits
+    for image in ("middle", "fine", "full"):
+        asked = make_problem(points, problem.photo.image(image))
+        descend_turns(asked, limits.num_iterations, limits.tolerance, R_cam_from_map, np.zeros(3))
+    return Pose(orthonormal(R_cam_from_map), pose.center_world)

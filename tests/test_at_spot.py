@@ -1,0 +1,130 @@
+"""Poses of photos at a spot where others were taken."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rooms
+from groups import SEED, one_taken
+
+from piccolo.evidence.examine import examine
+from piccolo.geometry.pose import Pose, angle_between, exp_so3, yaw_rotation
+from piccolo.geometry.pose_gaussian import PoseGaussian
+from piccolo.judge.by_others import share_nearby
+from piccolo.judge.candidate import NO_CANDIDATE, Selection
+from piccolo.localization.judging import Found
+from piccolo.problem.accuracy import Accuracy
+from piccolo.together.at_spot import Nearby, hold_at_spots, hold_turned, turn_at
+from piccolo.together.spot import fit_spot
+
+TIER = "scene"
+
+HERE = np.array([3.0, -2.0, 1.5])
+TURNS = (0.4, 1.6, 2.9, 4.1, 5.3)
+NUM_NEAR = 40
+
+
+def _gaussian(pose, std=0.01, std_deg=0.5):
+    own = np.diag(np.repeat([np.radians(std_deg) ** 2, std**2], 3))
+    return PoseGaussian(pose, own, np.zeros((6, 6)))
+
+
+def _spot(center, arm=0.0):
+    """Where somebody stands who turned about an axis through a centre."""
+    rotations = [exp_so3(np.array([0.05, 0.1, 0.0])) @ yaw_rotation(turn) for turn in TURNS]
+    return fit_spot([_gaussian(Pose(R, center + arm * R[0])) for R in rotations])
+
+
+def _nearby(*spots):
+    return Nearby(spots, NUM_NEAR, Accuracy())
+
+
+def _average(offset, std):
+    """A photo that was found at an offset from a spot, and what it becomes there."""
+    pose = Pose(yaw_rotation(2.2), HERE + offset)
+    candidate = replace(NO_CANDIDATE, pose=pose)
+    return _nearby(_spot(HERE)).average(candidate, _gaussian(pose, std), _spot(HERE), 0.01)
+
+
+def test_a_photo_is_averaged_with_the_spot_by_the_errors_of_both():
+    loose, tight = _average(np.array([0.06, 0.0, 0.0]), 0.06), _average(np.array([0.06, 0.0, 0.0]), 0.02)
+    offs = [held.gaussian.pose.center_world[0] - HERE[0] for held in (loose, tight)]
+    assert 0.0 < offs[0] < 0.02
+    assert offs[0] < offs[1] < 0.06
+    assert all(held.gaussian.largest_std < std for held, std in ((loose, 0.06), (tight, 0.02)))
+    assert loose.candidate.log_by_others > 3.0, "its place is likelier than others"
+    assert loose.exact.at_spot > loose.exact.alone
+    assert angle_between(loose.gaussian.pose.R_cam_from_world, yaw_rotation(2.2)) < 1e-6, "and not turned"
+
+
+def test_a_photo_that_contradicts_the_spot_was_taken_elsewhere():
+    """Half a metre beside, with an error of 2 cm the spot does not move it; with one as large it does."""
+    beside = np.array([0.5, 0.0, 0.0])
+    assert _average(beside, 0.02) is None
+    held = _average(beside, 0.5)
+    assert np.linalg.norm(held.gaussian.pose.center_world - HERE) < 0.05
+
+
+def test_elsewhere_a_photo_has_its_own_pose_and_less_odds():
+    pose = Pose(yaw_rotation(2.2), HERE)
+    nearby = _nearby(_spot(HERE))
+    held = nearby.take_elsewhere(replace(NO_CANDIDATE, pose=pose), _gaussian(pose, 0.05))
+    assert held.gaussian.pose is pose
+    assert held.shares == share_nearby([0.0], NUM_NEAR)
+    assert held.candidate.log_by_others < 0.0
+    assert held.exact.alone == pytest.approx(Accuracy().probability(_gaussian(pose, 0.05)))
+    assert nearby.take_elsewhere(NO_CANDIDATE).gaussian is None
+
+
+def test_of_several_spots_the_likeliest_counts():
+    here, there = _spot(HERE), _spot(HERE + 2.0)
+    nearby = _nearby(here, there)
+    assert nearby.find_likeliest(Pose(yaw_rotation(1.0), HERE + 0.1)) is here
+    assert nearby.find_likeliest(Pose(yaw_rotation(1.0), HERE + 1.9)) is there
+    assert _nearby().find_likeliest(Pose(yaw_rotation(1.0), HERE)) is None
+
+
+def test_the_position_of_a_turned_photo_follows_the_arm():
+    """Held out 40 cm, the camera moves as it turns: the end is where the spot expects its rotation."""
+    problem, true_pose = _photo()
+    spot = _spot(true_pose.center_world - 0.4 * true_pose.R_cam_from_world[0], arm=0.4)
+    start = Pose(exp_so3(np.array([0.0, 0.0, 0.05])) @ true_pose.R_cam_from_world, true_pose.center_world)
+    end = turn_at(problem, start, spot)
+    np.testing.assert_array_equal(end.center_world, spot.place(end.R_cam_from_world).center)
+    rooms.assert_near(end, true_pose, 0.03, 1.0)
+
+
+def test_a_photo_is_turned_only_where_it_fits():
+    """A spot where the photo shows something else does not have it."""
+    problem, true_pose = _photo()
+    best = examine(problem, true_pose)
+    here = _spot(true_pose.center_world)
+    held = hold_turned(problem, best, here, _nearby(here), rooms.WORKERS)
+    rooms.assert_near(held.gaussian.pose, true_pose, 0.04, 1.0)
+    assert held.candidate.log_by_others > 2.0
+    assert held.gaussian.largest_std < 0.1
+    beside = _spot(true_pose.center_world + np.array([0.7, 0.4, 0.0]))
+    assert hold_turned(problem, best, beside, _nearby(beside), rooms.WORKERS) is None
+
+
+def test_where_others_were_taken_decides_between_poses_that_fit_alike():
+    """The worse of two poses is where the others are; the photo itself fixes both."""
+    problem, true_pose = _photo()
+    best = examine(problem, true_pose)
+    far = examine(problem, Pose(true_pose.R_cam_from_world, true_pose.center_world + 0.02))
+    far = replace(
+        best, pose=Pose(far.pose.R_cam_from_world, true_pose.center_world + np.array([3.0, 0.0, 0.0]))
+    )
+    found = Found(problem, Selection(far, (best,)), None)
+    _, alone = hold_at_spots(found, _nearby(), rooms.WORKERS)
+    chosen, held = hold_at_spots(found, _nearby(_spot(true_pose.center_world)), rooms.WORKERS)
+    assert alone.candidate.log_by_others == pytest.approx(0.0)
+    assert held.candidate.pose is chosen.selection.best.pose
+    rooms.assert_near(held.gaussian.pose, true_pose, 0.05, 1.0)
+
+
+def _photo():
+    """A photo as it is asked for in the map, and its true pose there."""
+    panorama, pose = one_taken(1)
+    scan_map = rooms.scan_map(SEED)
+    return rooms.ask(panorama, scan_map, rooms.KNOWN), scan_map.from_world(pose)
