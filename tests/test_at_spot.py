@@ -31,7 +31,7 @@ def _gaussian(pose, std=0.01, std_deg=0.5):
 
 def _spot(center, arm=0.0):
     """Where somebody stands who turned about an axis through a centre."""
-    rotations = [exp_so3(np.array([0.05, 0.1, 0.0])) @ yaw_rotation(turn) for turn in TURNS]
+    rotations = [yaw_rotation(turn) for turn in TURNS]
     return fit_spot([_gaussian(Pose(R, center + arm * R[0])) for R in rotations])
 
 

@@ -121,7 +121,7 @@ def _nearby(located, alone, min_confidence=0.9):
     scan_map = rooms.scan_map(SEED)
     shot = Shot(one_taken(1)[0], replace(rooms.KNOWN, min_confidence=min_confidence))
     means = Means(rooms.KNOWN.effort, rooms.WORKERS, Stopwatch())
-    return localize_nearby(scan_map, shot, alone, _measure(located), False, means)
+    return localize_nearby(scan_map, shot, alone, _measure(located), means)
 
 
 def test_a_photo_is_found_where_the_others_were_taken():

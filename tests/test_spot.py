@@ -8,7 +8,14 @@ from scipy.stats import multivariate_normal
 
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian
-from piccolo.together.spot import LEAST_AT_SPOT, Positioned, compute_density, find_spots, fit_spot
+from piccolo.together.spot import (
+    LEAST_AT_SPOT,
+    Positioned,
+    compute_density,
+    differentiate_position,
+    find_spots,
+    fit_spot,
+)
 
 TIER = "pure"
 
@@ -20,9 +27,9 @@ def _draw(rng, turns, arm, steadiness, axis=AXIS):
     """Poses of somebody who turns with a camera held out, each with its error."""
     poses = []
     for turn in turns:
-        tilt = exp_so3(rng.normal(0.0, 0.08, 3))
-        R_cam_from_map = tilt @ yaw_rotation(turn)
-        center = axis + np.array([arm, 0.0, 0.0]) @ R_cam_from_map
+        wrist = exp_so3(rng.normal(0.0, 0.1, 3) * [1.0, 1.0, 0.0])
+        R_cam_from_map = wrist @ yaw_rotation(turn)
+        center = axis + np.array([arm, 0.0, 0.0]) @ yaw_rotation(turn)
         poses.append(Pose(R_cam_from_map, center + rng.normal(0.0, steadiness, 3)))
     return poses
 
@@ -130,3 +137,12 @@ def test_density_is_that_of_a_gaussian():
     point = AXIS + np.array([0.1, -0.2, 0.05])
     expected = multivariate_normal(AXIS, covariance).pdf(point)
     assert compute_density(Positioned(AXIS, covariance), point) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("pitch_deg", [0.0, -40.0, -85.0, 70.0])
+def test_the_arm_turns_with_the_heading_and_stays_level(pitch_deg):
+    """Whatever the wrist does, also if the camera looks at the floor or the ceiling."""
+    wrist = exp_so3(np.array([0.0, np.radians(pitch_deg), 0.0]))
+    A = differentiate_position(wrist @ yaw_rotation(0.9))
+    np.testing.assert_allclose(A[:, 3:].T, yaw_rotation(0.9)[:2], atol=1e-12)
+    np.testing.assert_array_equal(A[:, :3], np.eye(3))

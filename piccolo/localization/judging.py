@@ -39,6 +39,12 @@ class Found(NamedTuple):
         """Return the poses without the images and matches, which take memory."""
         return Found(self.problem.forget(), self.selection.forget(), self.fit)
 
+    def confirm(self) -> "Found":
+        """Return the poses with a camera that is as other photos say: a single one does not contradict it."""
+        if not isinstance(self.fit, FocalFit):
+            return self
+        return self._replace(fit=self.fit._replace(conflict=0.0))
+
 
 def judge(found: Found, means: Means, demand: Demand, may_promote: bool = True) -> Result:
     """Return the result for the best pose of a photo by itself.

@@ -7,8 +7,7 @@ another; else each keeps its own result.
 """
 
 import math
-from collections import Counter
-from collections.abc import Collection, Hashable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from hashlib import sha256
 from typing import NamedTuple
 
@@ -18,7 +17,6 @@ from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LIKELY
 from ..judge.by_others import Shares
-from ..judge.consensus import LEAST_AGREEING_PHOTOS
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result
 from ..localization.means import Means
@@ -83,8 +81,7 @@ def localize_group(
     """
     contents = [sha256(shot.panorama.rgb.tobytes()).digest() for shot in shots]
     order = sorted(range(len(shots)), key=contents.__getitem__)  # results do not depend on the order given
-    ordered = [shots[k] for k in order]
-    alone, members, asked = find_members(scan_map, ordered, workers, watch)
+    alone, members, asked = find_members(scan_map, [shots[k] for k in order], workers, watch)
     grouped = {k: Grouped(one, ()) for k, one in enumerate(alone)}
     matched = {k: one for k, one in members.items() if one.found.problem.profile.uses_matches}
     if matched:
@@ -92,8 +89,7 @@ def localize_group(
         with watch.stage("refine"):
             means = Means(settings.effort, workers, watch)
             grouped |= localize_linked(matched, means, settings.demand)
-            cameras = [shot.camera for shot in ordered]
-            grouped |= localize_rest(scan_map, asked, cameras, {k: grouped[k] for k in matched}, means)
+            grouped |= localize_rest(scan_map, asked, {k: grouped[k] for k in matched}, means)
     return [
         Grouped(grouped[k].result, tuple(sorted(order[other] for other in grouped[k].others)))
         for k in np.argsort(order)
@@ -101,28 +97,19 @@ def localize_group(
 
 
 def localize_rest(
-    scan_map: ScanMap,
-    shots: Sequence[Shot],
-    cameras: Sequence[Hashable],
-    grouped: Mapping[int, Grouped],
-    means: Means,
+    scan_map: ScanMap, shots: Sequence[Shot], grouped: Mapping[int, Grouped], means: Means
 ) -> dict[int, Grouped]:
-    """Return the results of photos that were not sure, but were found near where the others were taken.
-
-    `cameras` are those of all photos, as they were given.
-    """
+    """Return the results of photos that were not sure, but were found near where the others were taken."""
     sure = {k: one.result for k, one in grouped.items() if one.result.status == LOCALIZED}
     if len(sure) < LEAST_LOCATED:
         return {}
     located = [result.gaussian for result in sure.values() if result.gaussian]
-    agreeing = Counter(cameras[k] for k in sure)
-    found: dict[int, Grouped] = {}
-    for k in (k for k in grouped if k not in sure):
-        is_calibrated = agreeing[cameras[k]] >= LEAST_AGREEING_PHOTOS
-        result = localize_nearby(scan_map, shots[k], grouped[k].result, located, is_calibrated, means)
-        if result is not None:
-            found[k] = Grouped(result, tuple(sure))
-    return found
+    found = {
+        k: localize_nearby(scan_map, shots[k], one.result, located, means)
+        for k, one in grouped.items()
+        if k not in sure
+    }
+    return {k: Grouped(result, tuple(sure)) for k, result in found.items() if result}
 
 
 def localize_linked(members: Mapping[int, Member], means: Means, demand: Demand) -> dict[int, Grouped]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose
 from ..judge.candidate import Candidate
-from ..judge.consensus import MOST_CONFLICT, Consensus
+from ..judge.consensus import LEAST_AGREEING_PHOTOS, MOST_CONFLICT, Consensus
 from ..judge.probability import LOCALIZED
 from ..judge.reasons import Reason
 from ..judge.result import Result, nothing_found
@@ -70,6 +70,7 @@ class Shot(NamedTuple):
     panorama: Panorama
     settings: CoarseToFineSettings
     trace: Trace = NO_TRACE
+    is_confirmed: bool = False  # enough sure photos of the same camera agree with what is given of it
 
     @property
     def camera(self) -> tuple[object, ...]:
@@ -87,8 +88,9 @@ def find_members(
     """Find each of several photos by itself.
 
     Photos that are not sure are searched again with the focal length that sure photos of the same camera
-    have. Returns the result of each photo alone, the photos that could be searched by their numbers, and all
-    photos as they were searched last.
+    have; if these are enough, no single photo contradicts what is given of the camera. Returns the result of
+    each photo alone, the photos that could be searched by their numbers, and all photos as they were searched
+    last.
     """
     alone = [nothing_found() for _ in shots]
     members: dict[int, Member] = {}
@@ -109,7 +111,20 @@ def find_members(
         numbers = [k for k, shot in enumerate(shots) if shot.camera == camera]
         expected = expect_focal([shots[k].panorama for k in numbers], [alone[k] for k in numbers])
         find_each((numbers[n], shots[numbers[n]]._replace(panorama=one)) for n, one in expected.items())
+        if sum(alone[k].status == LOCALIZED for k in numbers) >= LEAST_AGREEING_PHOTOS:
+            for k in numbers:
+                asked[k] = asked[k]._replace(is_confirmed=True)
+            for k in (k for k in numbers if Reason.CALIBRATION in alone[k].belief.ruled_out):
+                members[k] = confirm(members[k], asked[k], Means(asked[k].settings.effort, workers, watch))
+                alone[k] = members[k].alone
     return alone, members, asked
+
+
+def confirm(member: Member, shot: Shot, means: Means) -> Member:
+    """Return a photo judged again, as the camera is as given by others."""
+    found = member.found.confirm()
+    judged = judge(found, means._replace(trace=shot.trace), shot.settings.demand, may_promote=False)
+    return Member(found.forget(), judged)
 
 
 def find_alone(scan_map: ScanMap, shot: Shot, workers: Workers, watch: Stopwatch) -> Member | None:

@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 
 from ..evidence.examine import examine
-from ..evidence.focal_length import FocalFit
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
 from ..judge.belief import make_belief
@@ -36,17 +35,11 @@ REACH = 1.0  # chosen: [m] from the nearest photo of those that were taken toget
 
 
 def localize_nearby(
-    scan_map: ScanMap,
-    shot: Shot,
-    alone: Result,
-    located: Sequence[PoseGaussian],
-    is_calibrated: bool,
-    means: Means,
+    scan_map: ScanMap, shot: Shot, alone: Result, located: Sequence[PoseGaussian], means: Means
 ) -> Result | None:
     """Return the result of a photo within reach of others, whose poses in the map are known.
 
-    `is_calibrated` says that enough sure photos of the same camera agree with what is given of it. None if
-    there is no candidate place, or if a pose there is not likelier than not, or no surer than alone.
+    None if there is no candidate place, or if a pose there is not likelier than not, or no surer than alone.
     """
     whole = prepare_search(scan_map, shot.panorama, shot.settings, means.watch)
     if whole is None:
@@ -57,8 +50,7 @@ def localize_nearby(
         return None
     problem = replace(whole, scan_map=near)
     searched = find(problem, scan_map, means)
-    if is_calibrated and isinstance(searched.fit, FocalFit):  # one photo does not contradict several
-        searched = searched._replace(fit=searched.fit._replace(conflict=0.0))
+    searched = searched.confirm() if shot.is_confirmed else searched
     if searched.selection.best.score < 0.0:
         return None
     demand = shot.settings.demand

@@ -18,7 +18,8 @@ from ..system.arrays import Array
 
 LEAST_AT_SPOT = 3  # photos by which it is told how steadily somebody stands
 STEPS_APART = 1.0  # chosen: [m] from a photo to the nearest other that was taken at the same spot
-ARM = 0.4  # chosen: [m] deviation of the offset along each axis of the camera
+ARM = 0.4  # chosen: [m] deviation of the offset, ahead and to each side
+LEAST_LEVEL = 0.5  # part of the direction of view that is level, from which it tells the heading
 STEADINESSES = (0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28)  # [m] deviations that may remain, each as likely
 FREE = 1e3  # [m] deviation of the axis's position before any photo
 
@@ -34,8 +35,8 @@ class Spot(NamedTuple):
     """Where somebody stands: for each deviation that may remain, its probability, and axis and offset."""
 
     probabilities: Array  # (S,)
-    means: Array  # (S, 6) [m] the axis's position in the map, and the camera's offset along its axes
-    covariances: Array  # (S, 6, 6) [m^2]
+    means: Array  # (S, 5) [m] the axis's position in the map, and the camera's offset ahead and to the left
+    covariances: Array  # (S, 5, 5) [m^2]
 
     def place(self, R_cam_from_map: Array) -> Positioned:
         """Return where a camera with a rotation (3, 3) is expected."""
@@ -49,8 +50,16 @@ class Spot(NamedTuple):
 
 
 def differentiate_position(R_cam_from_map: Array) -> Array:
-    """Return the derivative (3, 6) of a camera's position by the axis's position and the camera's offset."""
-    return np.concatenate([np.eye(3), R_cam_from_map.T], axis=1)
+    """Return the derivative (3, 5) of a camera's position by the axis's position and the camera's offset.
+
+    The offset, ahead and to the left, turns with the heading alone: the wrist lifts the camera, not the arm.
+    """
+    ahead, left, _ = R_cam_from_map
+    if math.hypot(ahead[0], ahead[1]) < LEAST_LEVEL:  # it looks up or down
+        ahead = np.array([left[1], -left[0], 0.0])
+    heading = np.array([ahead[0], ahead[1], 0.0]) / math.hypot(ahead[0], ahead[1])
+    beside = np.array([-heading[1], heading[0], 0.0])
+    return np.column_stack([np.eye(3), heading, beside])
 
 
 def find_spots(located: Sequence[PoseGaussian]) -> list[Spot]:
@@ -73,7 +82,7 @@ def fit_spot(located: Sequence[PoseGaussian]) -> Spot:
     centers = np.array([one.pose.center_world for one in located]) - origin
     A = np.array([differentiate_position(one.pose.R_cam_from_world) for one in located])
     errors = np.array([one.own[3:, 3:] for one in located])
-    known = np.diag(np.repeat([FREE**-2, ARM**-2], 3))
+    known = np.diag([FREE**-2] * 3 + [ARM**-2] * 2)
     logs = []
     means = []
     covariances = []
