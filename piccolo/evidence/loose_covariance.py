@@ -18,7 +18,7 @@ from .covariance import (
 )
 from .scan_errors import layer_covariance, scan_covariance
 
-FLAT = 1e-3  # chosen: curvature of the loss in a direction, divided by the greatest
+FLAT_CURVATURE = 1e-3  # chosen: curvature of the loss in a direction, divided by the greatest
 FLAT_DEVIATION = 1.0  # [rad] in a flat direction, moves as seen from the acting range
 MOST_FLAT = 2  # directions: along a wall, and up or around one axis
 
@@ -66,7 +66,7 @@ def loose_covariance(
     """
     units = np.repeat([1.0, acting_range], 3)
     curvatures, axes = np.linalg.eigh(units[:, None] * hessian * units)
-    is_flat = curvatures <= FLAT * curvatures[-1]
+    is_flat = curvatures <= FLAT_CURVATURE * curvatures[-1]
     known = axes[:, ~is_flat]
     slopes = known.T @ (units * gradients).T / curvatures[~is_flat, None]
     covariance = factor * known @ slopes @ slopes.T @ known.T

@@ -3,7 +3,7 @@
 Each source of evidence changes one respect of a photo's `Belief`, or gives a pose with its errors:
 - `localization.judging`: evidence of the photo alone gives `place`, its errors `within`, its camera `doubt`;
 - `together.bundle`, `together.group`: `believe_together`, by photos whose relative poses are known or found;
-- `together.nearby`: `believe_nearby`, by where the other photos of its group were taken;
+- `together.nearby`: `believe_nearby` and `believe_exact`, by where the other photos of its group were taken;
 - `together.mirrored`: `ruled_out`, if photos of one place fit better mirrored;
 - `together.beside`: `believe_beside`, by a photo that shows the same;
 - `localization.run`: `share_place` among results with several focal lengths;

@@ -10,8 +10,8 @@ from ..problem.problem import Problem
 from ..problem.stages import FULL
 from ..system.arrays import Array
 
-OF_TURN = GRADIENT, GRADIENT + 1, GRADIENT + 2, *(MATRIX + k for k in (0, 1, 2, 6, 7, 11))
-OF_MOVE = MATRIX + 15, MATRIX + 18, MATRIX + 20  # the diagonal alone: no gradient asks for a move
+SUMS_OF_TURN = GRADIENT, GRADIENT + 1, GRADIENT + 2, *(MATRIX + k for k in (0, 1, 2, 6, 7, 11))
+SUMS_OF_MOVE = MATRIX + 15, MATRIX + 18, MATRIX + 20  # the diagonal alone: no gradient asks for a move
 
 
 def turn_equations(
@@ -21,8 +21,8 @@ def turn_equations(
     channel_equations(problem, R_cam_from_world, center_world, sums)
     turning = np.zeros_like(sums)
     turning[:GRADIENT] = sums[:GRADIENT]
-    turning[list(OF_TURN)] = sums[list(OF_TURN)]
-    turning[list(OF_MOVE)] = 1.0
+    turning[list(SUMS_OF_TURN)] = sums[list(SUMS_OF_TURN)]
+    turning[list(SUMS_OF_MOVE)] = 1.0
     sums[:] = turning
 
 

@@ -59,7 +59,7 @@ class Held(NamedTuple):
 
 @dataclass(frozen=True)
 class Nearby:
-    """Where a photo may have been taken, by those that are sure."""
+    """Spots of sure photos, and their surroundings, in which another photo was probably taken."""
 
     spots: Sequence[Spot]
     num_near: int  # places of the scan within reach of them
@@ -69,7 +69,7 @@ class Nearby:
         """Return the spot at which a photo with a pose was taken likeliest; None if no spot is known."""
 
         def compute(spot: Spot) -> float:
-            return compute_density(blur(spot, pose, LOCAL_MOVES), pose.center_world)
+            return compute_density(blur_spot(spot, pose, LOCAL_MOVES), pose.center_world)
 
         return max(self.spots, key=compute, default=None)
 
@@ -109,11 +109,11 @@ class Nearby:
 
     def share(self, pose: Pose, errors: Array) -> NearbyShares:
         """Return the prior probabilities of the place of a pose whose position has errors (3, 3) [m^2]."""
-        densities = [compute_density(blur(spot, pose, errors), pose.center_world) for spot in self.spots]
+        densities = [compute_density(blur_spot(spot, pose, errors), pose.center_world) for spot in self.spots]
         return share_nearby([CELL_VOLUME * density for density in densities], self.num_near)
 
 
-def blur(spot: Spot, pose: Pose, errors: Array) -> Positioned:
+def blur_spot(spot: Spot, pose: Pose, errors: Array) -> Positioned:
     """Return where a photo with the rotation of a pose is expected at a spot, with further errors (3, 3)."""
     center, covariance = spot.place(pose.R_cam_from_world)
     return Positioned(center, covariance + errors)

@@ -115,12 +115,14 @@ def find_members(
             for k in numbers:
                 asked[k] = asked[k]._replace(is_confirmed=True)
             for k in (k for k in numbers if Reason.CALIBRATION in alone[k].belief.ruled_out):
-                members[k] = confirm(members[k], asked[k], Means(asked[k].settings.effort, workers, watch))
+                members[k] = confirm_camera(
+                    members[k], asked[k], Means(asked[k].settings.effort, workers, watch)
+                )
                 alone[k] = members[k].alone
     return alone, members, asked
 
 
-def confirm(member: Member, shot: Shot, means: Means) -> Member:
+def confirm_camera(member: Member, shot: Shot, means: Means) -> Member:
     """Return a photo judged again, as the camera is as given by others."""
     found = member.found.confirm()
     judged = judge(found, means._replace(trace=shot.trace), shot.settings.demand, may_promote=False)

@@ -1,9 +1,9 @@
-"""Where somebody stands who takes photos around: from photos that are sure follows where others were taken.
+"""The spot where somebody stands and takes photos around: from sure photos follows where others were taken.
 
 A person turns about their own axis and holds the camera before them, as far out as an arm reaches. So a
-photo's position is that of the axis, and an offset that turns with the camera. Axis, offset and how steadily
-both are kept are estimated from the photos that are sure; an offset of zero is a turn on the spot, and an
-unsteady one are a few steps. Bayesian linear regression, averaged over the deviations that may remain
+photo's position is that of the axis plus an offset that turns with the camera's heading. Axis, offset and how
+steadily both are kept are estimated from the photos that are sure; an offset of zero is a turn on the spot,
+and an unsteady one are a few steps. Bayesian linear regression, averaged over the deviations that may remain
 (Bishop, Pattern Recognition and Machine Learning, 2006, section 3.5).
 """
 
@@ -32,9 +32,9 @@ class Positioned(NamedTuple):
 
 
 class Spot(NamedTuple):
-    """Where somebody stands: for each deviation that may remain, its probability, and axis and offset."""
+    """Axis and offset of somebody who takes photos, for each deviation that may remain."""
 
-    probabilities: Array  # (S,)
+    probabilities: Array  # (S,) of the deviations
     means: Array  # (S, 5) [m] the axis's position in the map, and the camera's offset ahead and to the left
     covariances: Array  # (S, 5, 5) [m^2]
 
