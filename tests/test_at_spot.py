@@ -43,7 +43,7 @@ def _average(offset, std):
     """A photo that was found at an offset from a spot, and what it becomes there."""
     pose = Pose(yaw_rotation(2.2), HERE + offset)
     candidate = replace(NO_CANDIDATE, pose=pose)
-    return _nearby(_spot(HERE)).average(candidate, _gaussian(pose, std), _spot(HERE), 0.01)
+    return _nearby(_spot(HERE)).hold(candidate, _gaussian(pose, std), _spot(HERE), 0.01)
 
 
 def test_a_photo_is_averaged_with_the_spot_by_the_errors_of_both():
@@ -99,12 +99,13 @@ def test_a_photo_is_turned_only_where_it_fits():
     problem, true_pose = _photo()
     best = examine(problem, true_pose)
     here = _spot(true_pose.center_world)
-    held = hold_turned(problem, best, here, _nearby(here), rooms.WORKERS)
+    held = hold_turned(problem, best.pose, here, _nearby(here), 0.9 * best.score, rooms.WORKERS)
     rooms.assert_near(held.gaussian.pose, true_pose, 0.04, 1.0)
     assert held.candidate.log_by_others > 2.0
     assert held.gaussian.largest_std < 0.1
     beside = _spot(true_pose.center_world + np.array([0.7, 0.4, 0.0]))
-    assert hold_turned(problem, best, beside, _nearby(beside), rooms.WORKERS) is None
+    start = turn_at(problem, true_pose, beside)
+    assert hold_turned(problem, start, beside, _nearby(beside), 0.9 * best.score, rooms.WORKERS) is None
 
 
 def test_where_others_were_taken_decides_between_poses_that_fit_alike():
@@ -116,8 +117,8 @@ def test_where_others_were_taken_decides_between_poses_that_fit_alike():
         best, pose=Pose(far.pose.R_cam_from_world, true_pose.center_world + np.array([3.0, 0.0, 0.0]))
     )
     found = Found(problem, Selection(far, (best,)), None)
-    _, alone = hold_at_spots(found, _nearby(), rooms.WORKERS)
-    chosen, held = hold_at_spots(found, _nearby(_spot(true_pose.center_world)), rooms.WORKERS)
+    _, alone = hold_at_spots(found, _nearby(), rooms.means(rooms.KNOWN))
+    chosen, held = hold_at_spots(found, _nearby(_spot(true_pose.center_world)), rooms.means(rooms.KNOWN))
     assert alone.candidate.log_by_others == pytest.approx(0.0)
     assert held.candidate.pose is chosen.selection.best.pose
     rooms.assert_near(held.gaussian.pose, true_pose, 0.05, 1.0)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..evidence.covariance import estimate_pose_errors
-from ..evidence.examine import choose, examine
+from ..evidence.examine import choose, examine, examine_each
 from ..evidence.loose_covariance import estimate_loosely
 from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose
@@ -24,6 +24,8 @@ from ..judge.probability import log_odds
 from ..judge.selection import assess
 from ..localization.judging import Found
 from ..localization.ladder import refine
+from ..localization.means import Means
+from ..localization.search import search_poses
 from ..localization.turning import turn
 from ..problem.accuracy import Accuracy
 from ..problem.problem import Problem
@@ -31,10 +33,11 @@ from ..problem.stages import FULL
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..system.arrays import Array
 from ..system.jobs.threads import Workers
-from .bundle import compare_errors
+from .bundle import EVEN_ODDS, compare_errors
 from .optima import spread_optima
-from .spot import Positioned, Spot, compute_density
+from .spot import LEAST_AT_SPOT, Positioned, Spot, compute_density, fit_spot, gather
 
+NUM_SEARCHED = 12  # rotations of a photo at a spot that are turned to where it fits best
 NUM_HELD = 4  # poses of a photo that are held at a spot
 LEAST_HELD = 0.7  # chosen: their score, divided by the best one's
 FITS_THERE = 0.9  # chosen: score of a pose that was turned at a spot, divided by that of where it fits best
@@ -86,17 +89,15 @@ class Nearby:
         exact = NearbyErrors(0.0, 0.0, within)
         return Held(self.weigh(candidate, shares), alone, shares, exact, std_of_fit)
 
-    def average(
+    def hold(
         self, candidate: Candidate, alone: PoseGaussian, spot: Spot, std_of_fit: float | None
     ) -> Held | None:
         """Return the mean of a pose by the photo alone and of a spot; None if both contradict each other."""
-        pose = alone.pose
-        center, covariance = spot.place(pose.R_cam_from_world)
-        there = PoseGaussian(Pose(pose.R_cam_from_world, center), loosen(covariance), NOTHING_COMMON)
-        if alone.square_distance(there) > LIKELY:
+        there = expect(alone.pose.R_cam_from_world, spot)
+        fused = average(alone, there)
+        if fused is None:
             return None
-        fused = alone.fuse(there)
-        shares = self.share(pose, alone.covariance[OF_MOVE, OF_MOVE])
+        shares = self.share(alone.pose, alone.covariance[OF_MOVE, OF_MOVE])
         missed = there.own.copy()
         missed[OF_TURN, OF_TURN] = alone.covariance[OF_TURN, OF_TURN] + LOCAL_ERRORS[OF_TURN, OF_TURN]
         exact = NearbyErrors(
@@ -119,11 +120,28 @@ def blur_spot(spot: Spot, pose: Pose, errors: Array) -> Positioned:
     return Positioned(center, covariance + errors)
 
 
-def loosen(position: Array) -> Array:
-    """Return the covariance (6, 6) of a pose whose position alone is known, with a covariance (3, 3)."""
-    covariance = LOOSE_TURN**2 * np.eye(6)
-    covariance[OF_MOVE, OF_MOVE] = position
-    return covariance
+def expect(R_cam_from_map: Array, spot: Spot) -> PoseGaussian:
+    """Return the pose that is expected of a photo with a rotation (3, 3) at a spot; its rotation is open."""
+    center, covariance = spot.place(R_cam_from_map)
+    errors = LOOSE_TURN**2 * np.eye(6)
+    errors[OF_MOVE, OF_MOVE] = covariance
+    return PoseGaussian(Pose(R_cam_from_map, center), errors, NOTHING_COMMON)
+
+
+def average(alone: PoseGaussian, there: PoseGaussian) -> PoseGaussian | None:
+    """Return the mean of a pose by a photo alone and of where it is expected; None if both contradict."""
+    return None if alone.square_distance(there) > LIKELY else alone.fuse(there)
+
+
+def average_each(located: Sequence[PoseGaussian]) -> list[PoseGaussian]:
+    """Return poses in the map of sure photos, each averaged with the spot of the others, if it is at one."""
+    averaged = list(located)
+    for group in gather([one.pose for one in located]):
+        for k in group if len(group) > LEAST_AT_SPOT else []:
+            spot = fit_spot([located[n] for n in group if n != k])
+            there = expect(located[k].pose.R_cam_from_world, spot)
+            averaged[k] = average(located[k], there) or located[k]
+    return averaged
 
 
 def turn_at(problem: Problem, pose: Pose, spot: Spot) -> Pose:
@@ -138,14 +156,17 @@ def move_to(spot: Spot, pose: Pose) -> Pose:
     return Pose(pose.R_cam_from_world, spot.place(pose.R_cam_from_world).center)
 
 
-def hold_at_spots(found: Found, nearby: Nearby, workers: Workers) -> tuple[Found, Held]:
+def hold_at_spots(found: Found, nearby: Nearby, means: Means) -> tuple[Found, Held]:
     """Return the poses found for a photo, chosen by where others were taken too, and the best of them."""
     problem = found.problem
+    workers = means.workers
     candidates = found.selection.candidates
     least = LEAST_HELD * found.selection.best.score
     asked = [one for one in candidates[:NUM_HELD] if one.score >= least]
-    every = [hold(found, one, nearby, workers) for one in asked]
+    every = [hold_best(found, one, nearby, workers) for one in asked]
     every += [nearby.take_elsewhere(one) for one in candidates if not any(one is other for other in asked)]
+    if not any(one.shares.of_spot > EVEN_ODDS for one in every):
+        every += search_at_spots(found, nearby, means)
     standings = assess(problem.profile, Selection(every[0].candidate, tuple(h.candidate for h in every[1:])))
     order = np.argsort([-log_odds(standing, problem.method) for standing in standings], kind="stable")
     best, *others = suppress_near([every[k].candidate for k in order], len(every), ONE_ANSWER)
@@ -154,28 +175,49 @@ def hold_at_spots(found: Found, nearby: Nearby, workers: Workers) -> tuple[Found
     return found._replace(selection=chosen), held
 
 
-def hold(found: Found, candidate: Candidate, nearby: Nearby, workers: Workers) -> Held:
+def hold_best(found: Found, candidate: Candidate, nearby: Nearby, workers: Workers) -> Held:
     """Return a pose at the likeliest spot, or as taken elsewhere if the photo contradicts that."""
     problem = found.problem
     errors = estimate_pose_errors(problem, candidate, workers)
     errors = errors.widen(found.fit.pose_covariance) if found.fit else errors
     alone = errors.gaussian
     spot = nearby.find_likeliest(candidate.pose)
-    if alone is None:
-        turned = spot and hold_turned(problem, candidate, spot, nearby, workers)
+    if alone is None and spot is not None:
+        start = turn_at(problem, candidate.pose, spot)
+        turned = hold_turned(problem, start, spot, nearby, FITS_THERE * candidate.score, workers)
         return turned or nearby.take_elsewhere(candidate)
+    if alone is None:
+        return nearby.take_elsewhere(candidate)
     alone = alone.blur(spread_optima(problem, candidate, alone, workers))
-    averaged = spot and nearby.average(candidate, alone, spot, errors.std_of_fit)
+    averaged = spot and nearby.hold(candidate, alone, spot, errors.std_of_fit)
     return averaged or nearby.take_elsewhere(candidate, alone, errors.std_of_fit)
 
 
 def hold_turned(
-    problem: Problem, candidate: Candidate, spot: Spot, nearby: Nearby, workers: Workers
+    problem: Problem, start: Pose, spot: Spot, nearby: Nearby, least_score: float, workers: Workers
 ) -> Held | None:
-    """Return the pose of a photo that does not fix it, at a spot; None if it does not fit there."""
-    start = turn_at(problem, candidate.pose, spot)
+    """Return the pose of a photo that does not fix it, near a start; None if it does not fit at the spot."""
     turned = examine(problem, refine(problem, start, workers, FULL).pose)
-    alone = estimate_loosely(problem, turned)
-    if alone is None or turned.score < FITS_THERE * candidate.score:
+    if turned.score < least_score:
         return None
-    return nearby.average(turned, alone, spot, None)
+    alone = estimate_loosely(problem, turned)
+    return None if alone is None else nearby.hold(turned, alone, spot, None)
+
+
+def search_at_spots(found: Found, nearby: Nearby, means: Means) -> list[Held]:
+    """Search the rotations of a photo at each spot; return the poses that fit about as well as the best."""
+    problem = found.problem
+    least = FITS_THERE * found.selection.best.score
+    tilts = "known" if problem.photo.has_tilt else problem.profile.default_tilt
+    centers = problem.scan_map.centers[problem.scan_map.sparse]
+    held = []
+    for spot in nearby.spots:
+        apart = np.linalg.norm(centers - spot.axis, axis=1)
+        there = replace(problem, scan_map=problem.scan_map.narrow(apart <= apart.min()))
+        starts = search_poses(there, tilts, means.effort, means.workers).poses()[:NUM_SEARCHED]
+        turned = [turn_at(problem, start, spot) for start in starts]
+        fitting = sorted(examine_each(problem, turned, means.workers), key=lambda one: -one.score)
+        held += [
+            hold_turned(problem, one.pose, spot, nearby, least, means.workers) for one in fitting[:NUM_HELD]
+        ]
+    return [one for one in held if one is not None]

@@ -8,6 +8,7 @@ another; else each keeps its own result.
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from hashlib import sha256
 from typing import NamedTuple
 
@@ -15,8 +16,9 @@ import numpy as np
 
 from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose
-from ..geometry.pose_gaussian import LIKELY
+from ..geometry.pose_gaussian import LIKELY, PoseGaussian
 from ..judge.by_others import Shares
+from ..judge.conclude import take_pose
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result
 from ..localization.means import Means
@@ -24,6 +26,7 @@ from ..problem.accuracy import Demand
 from ..scan_map.scan_map import ScanMap
 from ..system.arrays import Array
 from ..system.jobs.threads import Stopwatch, Workers, one_blas_thread
+from .at_spot import average_each
 from .bundle import EVEN_ODDS, judge_placed, place_between
 from .bundle_search import NUM_BUNDLES, Support, find_supports, weigh_bundles
 from .expected import locate_all
@@ -99,17 +102,37 @@ def localize_group(
 def localize_rest(
     scan_map: ScanMap, shots: Sequence[Shot], grouped: Mapping[int, Grouped], means: Means
 ) -> dict[int, Grouped]:
-    """Return the results of photos that were not sure, but were found near where the others were taken."""
+    """Return the results of photos near where others were taken: of those not sure that are found there.
+
+    Poses of sure photos are averaged with where the others were taken.
+    """
     sure = {k: one.result for k, one in grouped.items() if one.result.status == LOCALIZED}
-    if len(sure) < LEAST_LOCATED:
+    located = {k: result.gaussian for k, result in sure.items() if result.gaussian}
+    if len(located) < LEAST_LOCATED:
         return {}
-    located = [result.gaussian for result in sure.values() if result.gaussian]
+    known = list(located.values())
     found = {
-        k: localize_nearby(scan_map, shots[k], one.result, located, means)
+        k: localize_nearby(scan_map, shots[k], one.result, known, means)
         for k, one in grouped.items()
         if k not in sure
     }
-    return {k: Grouped(result, tuple(sure)) for k, result in found.items() if result}
+    averaged = {
+        k: take_average(sure[k], mean, scan_map, shots[k].settings.demand)
+        for k, mean in zip(located, average_each(known), strict=True)
+    }
+    return {
+        **{k: Grouped(result, tuple(sure)) for k, result in found.items() if result},
+        **{k: grouped[k]._replace(result=result) for k, result in averaged.items()},
+    }
+
+
+def take_average(result: Result, mean: PoseGaussian, scan_map: ScanMap, demand: Demand) -> Result:
+    """Return the result of a sure photo with its pose averaged with where others were taken."""
+    if mean is result.gaussian:
+        return result
+    within = max(demand.accuracy.probability(mean), result.belief.within)
+    belief = replace(result.belief, within=within)
+    return take_pose(result, mean, scan_map).take_belief(belief, demand.min_confidence)
 
 
 def localize_linked(members: Mapping[int, Member], means: Means, demand: Demand) -> dict[int, Grouped]:

@@ -39,7 +39,7 @@ def localize_nearby(
 ) -> Result | None:
     """Return the result of a photo within reach of others, whose poses in the map are known.
 
-    None if there is no candidate place, or if a pose there is not likelier than not, or no surer than alone.
+    None if there is no candidate place, or if it is not likelier than not, or the photo no surer than alone.
     """
     whole = prepare_search(scan_map, shot.panorama, shot.settings, means.watch)
     if whole is None:
@@ -55,12 +55,13 @@ def localize_nearby(
         return None
     demand = shot.settings.demand
     nearby = Nearby(find_spots(located), len(near.sparse), demand.accuracy)
-    found, held = hold_at_spots(searched, nearby, means.workers)
+    found, held = hold_at_spots(searched, nearby, means)
     elsewhere = compute_odds_elsewhere(scan_map, alone, poses)
     gain = len(whole.scan_map.sparse) / len(near.sparse)
     result = judge_nearby(found, held, elsewhere, gain, means, demand)
-    least = max(alone.confidence, EVEN_ODDS)
-    return result if result and result.confidence > least else None
+    if result is None or result.belief.best_place <= EVEN_ODDS:
+        return None
+    return result if result.confidence > alone.confidence else None
 
 
 def judge_nearby(

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
 from ..system.arrays import Array
 
@@ -37,6 +38,11 @@ class Spot(NamedTuple):
     probabilities: Array  # (S,) of the deviations
     means: Array  # (S, 5) [m] the axis's position in the map, and the camera's offset ahead and to the left
     covariances: Array  # (S, 5, 5) [m^2]
+
+    @property
+    def axis(self) -> Array:
+        """Position (3,) of the axis in the map [m]."""
+        return np.asarray((self.probabilities @ self.means)[:3])
 
     def place(self, R_cam_from_map: Array) -> Positioned:
         """Return where a camera with a rotation (3, 3) is expected."""
@@ -64,16 +70,22 @@ def differentiate_position(R_cam_from_map: Array) -> Array:
 
 def find_spots(located: Sequence[PoseGaussian]) -> list[Spot]:
     """Find the spots where enough photos were taken, whose poses in the map are known."""
-    spots = []
-    left = list(located)
+    groups = gather([one.pose for one in located])
+    return [fit_spot([located[k] for k in group]) for group in groups if len(group) >= LEAST_AT_SPOT]
+
+
+def gather(poses: Sequence[Pose]) -> list[list[int]]:
+    """Return the numbers of the poses that are near each other, or by way of others, in order."""
+    left = list(range(len(poses)))
+    groups = []
     while left:
-        near = [left.pop(0)]
-        for one in near:
-            near += [other for other in left if one.pose.distance(other.pose) <= STEPS_APART]
-            left = [other for other in left if one.pose.distance(other.pose) > STEPS_APART]
-        if len(near) >= LEAST_AT_SPOT:
-            spots.append(fit_spot(near))
-    return spots
+        group = left[:1]
+        for k in group:
+            apart = {n: poses[k].distance(poses[n]) for n in left if n not in group}
+            group += [n for n, distance in apart.items() if distance <= STEPS_APART]
+        groups.append(sorted(group))
+        left = [k for k in left if k not in group]
+    return groups
 
 
 def fit_spot(located: Sequence[PoseGaussian]) -> Spot:
