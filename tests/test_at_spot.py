@@ -14,7 +14,14 @@ from piccolo.judge.by_others import share_nearby
 from piccolo.judge.candidate import NO_CANDIDATE, Selection
 from piccolo.localization.judging import Found
 from piccolo.problem.accuracy import Accuracy
-from piccolo.together.at_spot import Nearby, hold_at_spots, hold_turned, turn_at
+from piccolo.together.at_spot import (
+    Nearby,
+    average_each,
+    hold_at_spots,
+    hold_turned,
+    search_at_spots,
+    turn_at,
+)
 from piccolo.together.spot import fit_spot
 
 TIER = "scene"
@@ -122,6 +129,36 @@ def test_where_others_were_taken_decides_between_poses_that_fit_alike():
     assert alone.candidate.log_by_others == pytest.approx(0.0)
     assert held.candidate.pose is chosen.selection.best.pose
     rooms.assert_near(held.gaussian.pose, true_pose, 0.05, 1.0)
+
+
+def test_rotations_are_searched_at_a_spot_where_no_pose_was_found():
+    """The search has found the photo elsewhere only, looking the other way."""
+    problem, true_pose = _photo()
+    away = Pose(yaw_rotation(2.0) @ true_pose.R_cam_from_world, true_pose.center_world)
+    found = Found(problem, Selection(examine(problem, away), ()), None)
+    here = _nearby(_spot(true_pose.center_world))
+    held = search_at_spots(found, here, rooms.means(rooms.KNOWN))
+    best = max(held, key=lambda one: one.candidate.score)
+    rooms.assert_near(best.gaussian.pose, true_pose, 0.03, 1.0)
+    chosen, one = hold_at_spots(found, here, rooms.means(rooms.KNOWN))
+    rooms.assert_near(chosen.selection.best.pose, true_pose, 0.1, 2.0)
+    assert one.gaussian.largest_std < 0.1
+
+
+def test_sure_photos_are_averaged_with_the_spot_of_the_others():
+    """One of six is 6 cm off, with an error of 4 cm; the others stay nearly where they are, one elsewhere."""
+    poses = [Pose(yaw_rotation(turn), HERE) for turn in TURNS]
+    off = Pose(yaw_rotation(6.0), HERE + np.array([0.06, 0.0, 0.0]))
+    far = Pose(yaw_rotation(1.0), HERE + 7.0)
+    given = [*map(_gaussian, poses), _gaussian(off, 0.04), _gaussian(far)]
+    averaged = average_each(given)
+    moved = [one.pose.distance(other.pose) for one, other in zip(given, averaged, strict=True)]
+    assert max(moved[:5]) < 0.01
+    assert moved[6] == 0.0
+    assert averaged[6] is given[6]
+    assert averaged[5].pose.distance(Pose(off.R_cam_from_world, HERE)) < 0.03
+    assert averaged[5].largest_std < 0.03
+    assert average_each(given[:3]) == given[:3], "three photos do not tell where a third was taken"
 
 
 def _photo():

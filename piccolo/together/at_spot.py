@@ -93,8 +93,8 @@ class Nearby:
         self, candidate: Candidate, alone: PoseGaussian, spot: Spot, std_of_fit: float | None
     ) -> Held | None:
         """Return the mean of a pose by the photo alone and of a spot; None if both contradict each other."""
-        there = expect(alone.pose.R_cam_from_world, spot)
-        fused = average(alone, there)
+        there = expect_at_spot(alone.pose.R_cam_from_world, spot)
+        fused = average_with_spot(alone, there)
         if fused is None:
             return None
         shares = self.share(alone.pose, alone.covariance[OF_MOVE, OF_MOVE])
@@ -120,7 +120,7 @@ def blur_spot(spot: Spot, pose: Pose, errors: Array) -> Positioned:
     return Positioned(center, covariance + errors)
 
 
-def expect(R_cam_from_map: Array, spot: Spot) -> PoseGaussian:
+def expect_at_spot(R_cam_from_map: Array, spot: Spot) -> PoseGaussian:
     """Return the pose that is expected of a photo with a rotation (3, 3) at a spot; its rotation is open."""
     center, covariance = spot.place(R_cam_from_map)
     errors = LOOSE_TURN**2 * np.eye(6)
@@ -128,7 +128,7 @@ def expect(R_cam_from_map: Array, spot: Spot) -> PoseGaussian:
     return PoseGaussian(Pose(R_cam_from_map, center), errors, NOTHING_COMMON)
 
 
-def average(alone: PoseGaussian, there: PoseGaussian) -> PoseGaussian | None:
+def average_with_spot(alone: PoseGaussian, there: PoseGaussian) -> PoseGaussian | None:
     """Return the mean of a pose by a photo alone and of where it is expected; None if both contradict."""
     return None if alone.square_distance(there) > LIKELY else alone.fuse(there)
 
@@ -139,8 +139,8 @@ def average_each(located: Sequence[PoseGaussian]) -> list[PoseGaussian]:
     for group in gather([one.pose for one in located]):
         for k in group if len(group) > LEAST_AT_SPOT else []:
             spot = fit_spot([located[n] for n in group if n != k])
-            there = expect(located[k].pose.R_cam_from_world, spot)
-            averaged[k] = average(located[k], there) or located[k]
+            there = expect_at_spot(located[k].pose.R_cam_from_world, spot)
+            averaged[k] = average_with_spot(located[k], there) or located[k]
     return averaged
 
 
