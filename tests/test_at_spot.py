@@ -11,12 +11,13 @@ from piccolo.evidence.examine import examine
 from piccolo.geometry.pose import Pose, angle_between, exp_so3, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian
 from piccolo.judge.by_others import share_nearby
-from piccolo.judge.candidate import NO_CANDIDATE, Selection
+from piccolo.judge.candidate import NO_CANDIDATE, NO_CHOICE, Selection
 from piccolo.localization.judging import Found
 from piccolo.problem.accuracy import Accuracy
 from piccolo.together.at_spot import (
     Nearby,
     average_each,
+    fits_mirrored,
     hold_at_spots,
     hold_turned,
     search_at_spots,
@@ -143,6 +144,20 @@ def test_rotations_are_searched_at_a_spot_where_no_pose_was_found():
     chosen, one = hold_at_spots(found, here, rooms.means(rooms.KNOWN))
     rooms.assert_near(chosen.selection.best.pose, true_pose, 0.1, 2.0)
     assert one.gaussian.largest_std < 0.1
+
+
+def test_a_mirrored_photo_explains_more_at_the_spot_when_it_is_turned_over():
+    """Only where no matches tell otherwise."""
+    problem, true_pose = _photo()
+    here = _nearby(_spot(true_pose.center_world))
+    own = here.take_elsewhere(examine(problem, true_pose))
+    assert not fits_mirrored(Found(problem, NO_CHOICE, None), own, here, rooms.means(rooms.KNOWN))
+    over = problem.mirror()
+    wrong = here.take_elsewhere(examine(over, true_pose))
+    assert wrong.candidate.score < own.candidate.score
+    assert fits_mirrored(Found(over, NO_CHOICE, None), wrong, here, rooms.means(rooms.KNOWN))
+    matched = wrong._replace(candidate=replace(wrong.candidate, num_matches=30))
+    assert not fits_mirrored(Found(over, NO_CHOICE, None), matched, here, rooms.means(rooms.KNOWN))
 
 
 def test_sure_photos_are_averaged_with_the_spot_of_the_others():

@@ -17,11 +17,11 @@ from ..evidence.loose_covariance import estimate_loosely
 from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LIKELY, PoseGaussian
-from ..judge.alternatives import suppress_near
+from ..judge.alternatives import sort_by_score, suppress_near
 from ..judge.by_others import LOCAL_ERRORS, NearbyErrors, NearbyShares, log_odds_nearby, share_nearby
 from ..judge.candidate import Candidate, Selection
 from ..judge.probability import log_odds
-from ..judge.selection import assess
+from ..judge.selection import assess, explains_more
 from ..localization.judging import Found
 from ..localization.ladder import refine
 from ..localization.means import Means
@@ -172,7 +172,7 @@ def hold_at_spots(found: Found, nearby: Nearby, means: Means) -> tuple[Found, He
     best, *others = suppress_near([every[k].candidate for k in order], len(every), ONE_ANSWER)
     chosen = choose(problem, Selection(best, tuple(others)), workers)
     held = next(one for one in every if one.candidate.pose is chosen.best.pose)
-    return found._replace(selection=chosen), held
+    return found._replace(selection=chosen), held._replace(candidate=chosen.best)
 
 
 def hold_best(found: Found, candidate: Candidate, nearby: Nearby, workers: Workers) -> Held:
@@ -208,16 +208,30 @@ def search_at_spots(found: Found, nearby: Nearby, means: Means) -> list[Held]:
     """Search the rotations of a photo at each spot; return the poses that fit about as well as the best."""
     problem = found.problem
     least = FITS_THERE * found.selection.best.score
+    held = [
+        hold_turned(problem, one.pose, spot, nearby, least, means.workers)
+        for spot in nearby.spots
+        for one in search_rotations(problem, spot, means)[:NUM_HELD]
+    ]
+    return [one for one in held if one is not None]
+
+
+def search_rotations(problem: Problem, spot: Spot, means: Means) -> list[Candidate]:
+    """Search the rotations of a photo at a spot; return the best poses there, best first."""
     tilts = "known" if problem.photo.has_tilt else problem.profile.default_tilt
     centers = problem.scan_map.centers[problem.scan_map.sparse]
-    held = []
-    for spot in nearby.spots:
-        apart = np.linalg.norm(centers - spot.axis, axis=1)
-        there = replace(problem, scan_map=problem.scan_map.narrow(apart <= apart.min()))
-        starts = search_poses(there, tilts, means.effort, means.workers).poses()[:NUM_SEARCHED]
-        turned = [turn_at(problem, start, spot) for start in starts]
-        fitting = sorted(examine_each(problem, turned, means.workers), key=lambda one: -one.score)
-        held += [
-            hold_turned(problem, one.pose, spot, nearby, least, means.workers) for one in fitting[:NUM_HELD]
-        ]
-    return [one for one in held if one is not None]
+    apart = np.linalg.norm(centers - spot.axis, axis=1)
+    there = replace(problem, scan_map=problem.scan_map.narrow(apart <= apart.min()))
+    starts = search_poses(there, tilts, means.effort, means.workers).poses()[:NUM_SEARCHED]
+    turned = [turn_at(problem, start, spot) for start in starts]
+    return sort_by_score(examine_each(problem, turned, means.workers))
+
+
+def fits_mirrored(found: Found, held: Held, nearby: Nearby, means: Means) -> bool:
+    """Return True if a photo with no matches explains more at a spot when it is mirrored, left for right."""
+    method = found.problem.method
+    if (held.candidate.num_matches or 0) > method.chance_matches:
+        return False
+    mirrored = found.problem.mirror()
+    best = [one for spot in nearby.spots for one in search_rotations(mirrored, spot, means)[:1]]
+    return any(explains_more(method, one, held.candidate) for one in best)

@@ -26,7 +26,7 @@ from ..problem.accuracy import Demand
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
 from ..system.arrays import Array
-from .at_spot import Held, Nearby, hold_at_spots
+from .at_spot import Held, Nearby, fits_mirrored, hold_at_spots
 from .bundle import EVEN_ODDS
 from .members import Shot
 from .spot import find_spots
@@ -59,9 +59,9 @@ def localize_nearby(
     elsewhere = compute_odds_elsewhere(scan_map, alone, poses)
     gain = len(whole.scan_map.sparse) / len(near.sparse)
     result = judge_nearby(found, held, elsewhere, gain, means, demand)
-    if result is None or result.belief.best_place <= EVEN_ODDS:
+    if result is None or result.belief.best_place <= EVEN_ODDS or result.confidence <= alone.confidence:
         return None
-    return result if result.confidence > alone.confidence else None
+    return None if fits_mirrored(found, held, nearby, means) else result
 
 
 def judge_nearby(
