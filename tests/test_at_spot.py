@@ -10,8 +10,10 @@ from groups import SEED, one_taken
 from piccolo.evidence.examine import examine
 from piccolo.geometry.pose import Pose, angle_between, exp_so3, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian
+from piccolo.judge.belief import make_belief
 from piccolo.judge.by_others import share_nearby
 from piccolo.judge.candidate import NO_CANDIDATE, NO_CHOICE, Selection
+from piccolo.judge.result import Result
 from piccolo.localization.judging import Found
 from piccolo.problem.accuracy import Accuracy
 from piccolo.together.at_spot import (
@@ -23,6 +25,7 @@ from piccolo.together.at_spot import (
     search_at_spots,
     turn_at,
 )
+from piccolo.together.group import take_average
 from piccolo.together.spot import fit_spot
 
 TIER = "scene"
@@ -174,6 +177,26 @@ def test_sure_photos_are_averaged_with_the_spot_of_the_others():
     assert averaged[5].pose.distance(Pose(off.R_cam_from_world, HERE)) < 0.03
     assert averaged[5].largest_std < 0.03
     assert average_each(given[:3]) == given[:3], "three photos do not tell where a third was taken"
+
+
+def test_an_averaged_photo_stays_as_sure_as_it_was():
+    """Its place is its own; its position is more exact, and it is no less so than before."""
+    scan_map = rooms.scan_map(SEED)
+    own = _gaussian(Pose(yaw_rotation(1.0), HERE), 0.05)
+    mean = _gaussian(Pose(yaw_rotation(1.0), HERE + 0.01), 0.02)
+    result = Result(
+        belief=make_belief([0.95], within=0.97), status="localized", gaussian=own, best_pose=own.pose
+    )
+    demand = rooms.KNOWN.demand
+    assert take_average(result, own, scan_map, demand) is result
+    averaged = take_average(result, mean, scan_map, demand)
+    assert averaged.gaussian is mean
+    assert averaged.status == "localized"
+    assert averaged.belief.place == result.belief.place
+    assert averaged.confidence > result.belief.probabilities[0]
+    assert averaged.best_pose.distance(scan_map.to_world(mean.pose)) < 1e-9
+    loose = take_average(result, _gaussian(own.pose, 0.5), scan_map, demand)
+    assert loose.belief.within == 0.97
 
 
 def _photo():
