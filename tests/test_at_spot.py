@@ -1,5 +1,6 @@
 """Poses of photos at a spot where others were taken."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +14,11 @@ from piccolo.geometry.pose_gaussian import PoseGaussian
 from piccolo.judge.belief import make_belief
 from piccolo.judge.by_others import share_nearby
 from piccolo.judge.candidate import NO_CANDIDATE, NO_CHOICE, Selection
+from piccolo.judge.case import Errors
 from piccolo.judge.result import Result
 from piccolo.localization.judging import Found
 from piccolo.problem.accuracy import Accuracy
+from piccolo.together import at_spot
 from piccolo.together.at_spot import (
     Nearby,
     average_each,
@@ -204,3 +207,24 @@ def _photo():
     panorama, pose = one_taken(1)
     scan_map = rooms.scan_map(SEED)
     return rooms.ask(panorama, scan_map, rooms.KNOWN), scan_map.from_world(pose)
+
+
+def test_a_mean_far_from_where_a_photo_was_found_is_turned_instead(monkeypatch):
+    """Over 25 cm the covariance of the pose that was found tells nothing of the rotation."""
+    problem, true_pose = _photo()
+    beside = Pose(true_pose.R_cam_from_world, true_pose.center_world + np.array([0.25, 0.0, 0.0]))
+    candidate = examine(problem, beside)
+    loose = Errors(_gaussian(beside, 0.3), 0.01)
+    monkeypatch.setattr(at_spot, "estimate_pose_errors", lambda *_: loose)
+    monkeypatch.setattr(at_spot, "spread_optima", lambda *_: np.zeros((6, 6)))
+    found = Found(problem, Selection(candidate, ()), None)
+    here = _nearby(_spot(true_pose.center_world))
+    held = at_spot.hold_best(found, candidate, here, rooms.WORKERS)
+    assert held.candidate.pose.distance(beside) > 0.1
+    rooms.assert_near(held.gaussian.pose, true_pose, 0.05, 1.0)
+    close = Errors(_gaussian(true_pose, 0.3), 0.01)
+    monkeypatch.setattr(at_spot, "estimate_pose_errors", lambda *_: close)
+    assert at_spot.hold_best(found, examine(problem, true_pose), here, rooms.WORKERS).std_of_fit == 0.01
+    assert held.std_of_fit is None
+    assert held.moves_by(beside) > 0.1
+    assert here.take_elsewhere(candidate).moves_by(beside) == math.inf

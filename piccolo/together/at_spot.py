@@ -5,6 +5,7 @@ taken elsewhere. One of a bare wall fixes no position. It has that of the spot, 
 where it fits best.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -41,6 +42,7 @@ NUM_SEARCHED = 12  # rotations of a photo at a spot that are turned to where it 
 NUM_HELD = 4  # poses of a photo that are held at a spot
 LEAST_HELD = 0.7  # chosen: their score, divided by the best one's
 FITS_THERE = 0.9  # chosen: score of a pose that was turned at a spot, divided by that of where it fits best
+MOST_MOVED = 0.1  # chosen: [m] that a mean moves a pose, over which its covariance holds; else it is turned
 ROUNDS_AT_SPOT = 2  # of a turn: the position follows the rotation
 CELL_VOLUME = COARSE_SPACING**3  # [m^3] of a place of the scan
 LOOSE_TURN = 1.0  # [rad] deviation of a rotation that others do not tell
@@ -58,6 +60,10 @@ class Held(NamedTuple):
     shares: NearbyShares  # of its place
     exact: NearbyErrors
     std_of_fit: float | None  # by the photo alone: as `Errors` has it
+
+    def moves_by(self, pose: Pose) -> float:
+        """Return how far it is from a pose [m]; infinitely far if nothing fixes it."""
+        return math.inf if self.gaussian is None else self.gaussian.pose.distance(pose)
 
 
 @dataclass(frozen=True)
@@ -181,16 +187,18 @@ def hold_best(found: Found, candidate: Candidate, nearby: Nearby, workers: Worke
     errors = estimate_pose_errors(problem, candidate, workers)
     errors = errors.widen(found.fit.pose_covariance) if found.fit else errors
     alone = errors.gaussian
+    if alone is not None:
+        alone = alone.blur(spread_optima(problem, candidate, alone, workers))
+    elsewhere = nearby.take_elsewhere(candidate, alone, errors.std_of_fit)
     spot = nearby.find_likeliest(candidate.pose)
-    if alone is None and spot is not None:
-        start = turn_at(problem, candidate.pose, spot)
-        turned = hold_turned(problem, start, spot, nearby, FITS_THERE * candidate.score, workers)
-        return turned or nearby.take_elsewhere(candidate)
-    if alone is None:
-        return nearby.take_elsewhere(candidate)
-    alone = alone.blur(spread_optima(problem, candidate, alone, workers))
-    averaged = spot and nearby.hold(candidate, alone, spot, errors.std_of_fit)
-    return averaged or nearby.take_elsewhere(candidate, alone, errors.std_of_fit)
+    if spot is None:
+        return elsewhere
+    if alone is not None:
+        averaged = nearby.hold(candidate, alone, spot, errors.std_of_fit)
+        if averaged is None or averaged.moves_by(alone.pose) <= MOST_MOVED:
+            return averaged or elsewhere
+    start = turn_at(problem, candidate.pose, spot)
+    return hold_turned(problem, start, spot, nearby, FITS_THERE * candidate.score, workers) or elsewhere
 
 
 def hold_turned(
