@@ -61,7 +61,8 @@ def _average(offset, std):
 
 
 def test_a_photo_is_averaged_with_the_spot_by_the_errors_of_both():
-    loose, tight = _average(np.array([0.06, 0.0, 0.0]), 0.06), _average(np.array([0.06, 0.0, 0.0]), 0.02)
+    loose = _average(np.array([0.06, 0.0, 0.0]), 0.06)
+    tight = _average(np.array([0.06, 0.0, 0.0]), 0.02)
     offs = [held.gaussian.pose.center_world[0] - HERE[0] for held in (loose, tight)]
     assert 0.0 < offs[0] < 0.02
     assert offs[0] < offs[1] < 0.06
@@ -91,7 +92,8 @@ def test_elsewhere_a_photo_has_its_own_pose_and_less_odds():
 
 
 def test_of_several_spots_the_likeliest_counts():
-    here, there = _spot(HERE), _spot(HERE + 2.0)
+    here = _spot(HERE)
+    there = _spot(HERE + 2.0)
     nearby = _nearby(here, there)
     assert nearby.find_likeliest(Pose(yaw_rotation(1.0), HERE + 0.1)) is here
     assert nearby.find_likeliest(Pose(yaw_rotation(1.0), HERE + 1.9)) is there

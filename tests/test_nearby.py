@@ -62,7 +62,8 @@ def test_at_a_spot_a_local_optimum_is_another_rotation():
 
 
 def test_places_at_a_spot_are_likelier_than_elsewhere_and_together_as_likely_as_nearby():
-    near, far = share_nearby([1.0], 50), share_nearby([0.0], 50)
+    near = share_nearby([1.0], 50)
+    far = share_nearby([0.0], 50)
     assert near.at_spot == IS_AT_SPOT
     assert near.elsewhere == far.elsewhere == pytest.approx((IS_NEARBY - IS_AT_SPOT) / 50)
     assert share_nearby([7.0], 50) == near, "a place holds at most what there is"
