@@ -106,7 +106,8 @@ def test_the_position_of_a_turned_photo_follows_the_arm():
     spot = _spot(true_pose.center_world - 0.4 * true_pose.R_cam_from_world[0], arm=0.4)
     start = Pose(exp_so3(np.array([0.0, 0.0, 0.05])) @ true_pose.R_cam_from_world, true_pose.center_world)
     end = turn_at(problem, start, spot)
-    np.testing.assert_array_equal(end.center_world, spot.place(end.R_cam_from_world).center)
+    expected = spot.attract(end.R_cam_from_world, start.center_world)
+    np.testing.assert_array_equal(end.center_world, expected.center_world)
     rooms.assert_near(end, true_pose, 0.03, 1.0)
 
 

@@ -236,12 +236,26 @@ def test_linked_photos_are_refused_if_they_fit_better_mirrored(monkeypatch, alon
     members = {k: SimpleNamespace(alone=_belief(status)) for k, status in enumerate(alone)}
     results = dict.fromkeys(members, _belief("localized")) | {2: _belief("not_localized")}
     members[2] = SimpleNamespace(alone=results[2])
-    refused = mirrored.refuse_mirrored(results, members, None, 0.9)
+    others = {0: (1,), 1: (0,), 2: ()}
+    refused = mirrored.refuse_mirrored(results, others, members, None, 0.9)
     assert list(refused) == ([0, 1] if is_refused else [])
     for result in refused.values():
         assert result.status == "not_localized"
         assert result.belief.ruled_out == {Reason.MIRRORED}
         assert result.warnings == (MIRRORED,)
+
+
+@pytest.mark.parametrize("is_together", [True, False])
+def test_a_photo_that_mirrored_ones_put_at_their_place_is_refused_with_them(monkeypatch, is_together):
+    """Of another place of linked photos, those that fit as they are do not speak for it."""
+    odds = iter((-3.0, 2.4, 0.0))
+    monkeypatch.setattr(mirrored, "compare_mirrored", lambda *_: next(odds))
+    statuses = ("localized", "not_localized", "mirrored")
+    members = {k: SimpleNamespace(alone=_belief(status)) for k, status in enumerate(statuses)}
+    results = dict.fromkeys(members, _belief("localized"))
+    others = {0: (), 1: (2,), 2: (1,)} if is_together else {0: (), 1: (), 2: ()}
+    refused = mirrored.refuse_mirrored(results, others, members, None, 0.9)
+    assert list(refused) == ([1, 2] if is_together else [1])
 
 
 @pytest.mark.parametrize("is_mirrored", [False, True])

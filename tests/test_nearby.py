@@ -122,7 +122,8 @@ def _nearby(located, alone, min_confidence=0.9):
     scan_map = rooms.scan_map(SEED)
     shot = Shot(one_taken(1)[0], replace(rooms.KNOWN, min_confidence=min_confidence))
     means = Means(rooms.KNOWN.effort, rooms.WORKERS, Stopwatch())
-    return localize_nearby(scan_map, shot, alone, _measure(located), means)
+    found = localize_nearby(scan_map, shot, alone, _measure(located), means)
+    return found and found.result
 
 
 def test_a_photo_is_found_where_the_others_were_taken():

@@ -72,6 +72,12 @@ def believe_nearby(near: Belief, elsewhere: float, gain: float) -> Belief:
     return replace(belief, ruled_out=near.ruled_out)
 
 
+def share_elsewhere(odds: float) -> float:
+    """Return the probability of a photo's places far from others, if it has none near them, by their odds."""
+    there = (1.0 - IS_NEARBY) * odds
+    return there / (1.0 + there)
+
+
 class NearbyShares(NamedTuple):
     """Prior probabilities that a photo was taken in one place of the scan, by photos that are sure."""
 

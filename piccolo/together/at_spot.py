@@ -57,6 +57,7 @@ class Held(NamedTuple):
 
     candidate: Candidate  # with the odds of its place by the others
     gaussian: PoseGaussian | None  # in the map; None where nothing fixes the pose
+    alone: PoseGaussian | None  # by the photo alone; None where it fixes nothing
     shares: NearbyShares  # of its place
     exact: NearbyErrors
     std_of_fit: float | None  # by the photo alone: as `Errors` has it
@@ -93,7 +94,7 @@ class Nearby:
         shares = share_nearby([0.0] * len(self.spots), self.num_near)
         within = 0.0 if alone is None else self.accuracy.probability(alone)
         exact = NearbyErrors(0.0, 0.0, within)
-        return Held(self.weigh(candidate, shares), alone, shares, exact, std_of_fit)
+        return Held(self.weigh(candidate, shares), alone, alone, shares, exact, std_of_fit)
 
     def hold(
         self, candidate: Candidate, alone: PoseGaussian, spot: Spot, std_of_fit: float | None
@@ -112,7 +113,7 @@ class Nearby:
             self.accuracy.probability_at(fused.pose, alone),
             compare_errors(there, alone),
         )
-        return Held(self.weigh(candidate, shares), fused, shares, exact, std_of_fit)
+        return Held(self.weigh(candidate, shares), fused, alone, shares, exact, std_of_fit)
 
     def share(self, pose: Pose, errors: Array) -> NearbyShares:
         """Return the prior probabilities of the place of a pose whose position has errors (3, 3) [m^2]."""
@@ -152,14 +153,10 @@ def average_each(located: Sequence[PoseGaussian]) -> list[PoseGaussian]:
 
 def turn_at(problem: Problem, pose: Pose, spot: Spot) -> Pose:
     """Return the pose at a spot whose rotation fits the photo best, near that of a pose."""
+    turned = pose
     for _ in range(ROUNDS_AT_SPOT):
-        pose = turn(problem, move_to(spot, pose))
-    return move_to(spot, pose)
-
-
-def move_to(spot: Spot, pose: Pose) -> Pose:
-    """Return a pose with the same rotation at a spot."""
-    return Pose(pose.R_cam_from_world, spot.place(pose.R_cam_from_world).center)
+        turned = turn(problem, spot.attract(turned.R_cam_from_world, pose.center_world))
+    return spot.attract(turned.R_cam_from_world, pose.center_world)
 
 
 def hold_at_spots(found: Found, nearby: Nearby, means: Means) -> tuple[Found, Held]:

@@ -43,14 +43,16 @@ from .links import (
 )
 from .members import Member, Shot, find_members
 from .mirrored import refuse_mirrored
-from .nearby import localize_nearby
+from .nearby import doubt_stray, localize_nearby
 from .optima import widen_unsure
+from .spot import LEAST_AT_SPOT, gather
 
 NUM_ANCHORS = 5  # poses of a photo from which a place of the group may follow, the likeliest
 LEAST_LIKELY = 1e-3  # chosen: probability of a pose from which a place of the group may follow
 MOST_SPREAD = 12  # places of the group that are tried
 BELONGS_WEAKLY = 0.7  # chosen: probability that a photo belongs where few matches put it
 LEAST_LOCATED = 2  # photos from which it follows where the others were taken
+NUM_REST_ROUNDS = 3  # in which photos that were found near others help to find further ones
 
 
 class Group(NamedTuple):
@@ -104,26 +106,45 @@ def localize_rest(
 ) -> dict[int, Grouped]:
     """Return the results of photos near where others were taken: of those not sure that are found there.
 
-    Poses of sure photos are averaged with where the others were taken.
+    Those that are sure there help to find the others. A photo that is sure of another place is doubted. Poses
+    of photos that were sure before are averaged with where the others were taken.
     """
     sure = {k: one.result for k, one in grouped.items() if one.result.status == LOCALIZED}
     located = {k: result.gaussian for k, result in sure.items() if result.gaussian}
     if len(located) < LEAST_LOCATED:
         return {}
+    strays = [k for k in list_strays(located) if not grouped[k].others]
+    located = {k: one for k, one in located.items() if k not in strays}
+    rest: dict[int, Grouped] = {}
+    left = [k for k in grouped if k not in sure]
+    for _ in range(NUM_REST_ROUNDS):
+        known = list(located.values())
+        asked = {k: localize_nearby(scan_map, shots[k], grouped[k].result, known, means) for k in left}
+        found = {k: one for k, one in asked.items() if one}
+        rest |= {k: Grouped(one.result, tuple(located)) for k, one in found.items()}
+        newly = {k: one.held.alone for k, one in found.items() if one.result.status == LOCALIZED}
+        joined = {k: alone for k, alone in newly.items() if alone}
+        left = [k for k in found if k not in joined]
+        if not joined:
+            break
+        located |= joined
     known = list(located.values())
-    found = {
-        k: localize_nearby(scan_map, shots[k], one.result, known, means)
-        for k, one in grouped.items()
-        if k not in sure
-    }
-    averaged = {
-        k: take_average(sure[k], mean, scan_map, shots[k].settings.demand)
-        for k, mean in zip(located, average_each(known), strict=True)
-    }
-    return {
-        **{k: Grouped(result, tuple(sure)) for k, result in found.items() if result},
-        **{k: grouped[k]._replace(result=result) for k, result in averaged.items()},
-    }
+    for k in strays:
+        rest[k] = Grouped(doubt_stray(scan_map, shots[k], sure[k], known, means), ())
+    for k, mean in zip(located, average_each(known), strict=True):
+        if k in sure:
+            averaged = take_average(sure[k], mean, scan_map, shots[k].settings.demand)
+            rest[k] = grouped[k]._replace(result=averaged)
+    return rest
+
+
+def list_strays(located: Mapping[int, PoseGaussian]) -> list[int]:
+    """List the photos that were taken at no spot, if others were."""
+    numbers = list(located)
+    groups = gather([one.pose for one in located.values()])
+    if max(map(len, groups)) < LEAST_AT_SPOT:
+        return []
+    return [numbers[k] for group in groups if len(group) < LEAST_AT_SPOT for k in group]
 
 
 def take_average(result: Result, mean: PoseGaussian, scan_map: ScanMap, demand: Demand) -> Result:
@@ -151,8 +172,10 @@ def localize_linked(members: Mapping[int, Member], means: Means, demand: Demand)
             for k, result in found.items():
                 grouped[k] = Grouped(result, tuple(other for other in found if other != k))
             left -= found.keys() or tested[0].places.keys()
-        results = {k: grouped[k].result if k in grouped else members[k].alone for k in numbers}
-        refused = refuse_mirrored(results, members, means, demand.min_confidence)
+        linked = {k: grouped.get(k, Grouped(members[k].alone, ())) for k in numbers}
+        results = {k: one.result for k, one in linked.items()}
+        others = {k: one.others for k, one in linked.items()}
+        refused = refuse_mirrored(results, others, members, means, demand.min_confidence)
         grouped |= {k: Grouped(result, ()) for k, result in refused.items()}
     return grouped
 

@@ -5,7 +5,7 @@ of a room may fit there, and several such photos confirm each other. If they are
 where they were taken.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from ..evidence.examine import choose
 from ..judge.conclude import rule_out_mirrored
@@ -20,12 +20,17 @@ from .members import Member
 
 
 def refuse_mirrored(
-    results: Mapping[int, Result], members: Mapping[int, Member], means: Means, min_confidence: float
+    results: Mapping[int, Result],
+    others: Mapping[int, Collection[int]],
+    members: Mapping[int, Member],
+    means: Means,
+    min_confidence: float,
 ) -> dict[int, Result]:
     """Return refused results of those localized photos among linked ones that were mirrored.
 
-    Mostly all linked photos were mirrored or none was. So the mirror images are searched if one of the photos
-    was ruled out as mirrored by itself, or if no localized photo was sure by itself.
+    `others` are the photos with which each was localized together. Mostly all of these were mirrored or none
+    was. So the mirror images are searched if one of the linked photos was ruled out as mirrored by itself, or
+    if no localized photo was sure by itself.
     """
     localized = [k for k, result in results.items() if result.status == LOCALIZED]
     one_is_mirrored = any(Reason.MIRRORED in members[k].alone.belief.ruled_out for k in results)
@@ -33,8 +38,12 @@ def refuse_mirrored(
     if not localized or (one_is_sure and not one_is_mirrored):
         return {}
     differences = {k: compare_mirrored(members[k], results[k], means) for k in localized}
-    mirrored = select_mirrored(differences, one_is_mirrored)
-    return {k: rule_out_mirrored(results[k], min_confidence) for k in mirrored}
+
+    def was_mirrored(number: int) -> bool:
+        together = {k: differences[k] for k in (number, *others[number]) if k in differences}
+        return number in select_mirrored(together, one_is_mirrored)
+
+    return {k: rule_out_mirrored(results[k], min_confidence) for k in filter(was_mirrored, localized)}
 
 
 def compare_mirrored(member: Member, result: Result, means: Means) -> float:

@@ -7,6 +7,8 @@ Where enough photos are sure, they also tell where somebody stands who took them
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +16,7 @@ from ..evidence.examine import examine
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
 from ..judge.belief import make_belief
-from ..judge.by_others import LEAST_NONE, believe_exact, believe_nearby
+from ..judge.by_others import LEAST_NONE, believe_exact, believe_nearby, share_elsewhere
 from ..judge.probability import posterior
 from ..judge.result import Result
 from ..judge.selection import assess, credit_copies
@@ -34,17 +36,56 @@ from .spot import find_spots
 REACH = 1.0  # chosen: [m] from the nearest photo of those that were taken together
 
 
+class FoundNearby(NamedTuple):
+    """A photo near others."""
+
+    result: Result
+    found: Found
+    held: Held  # the pose of the result
+    nearby: Nearby
+
+    def fits_mirrored(self, means: Means) -> bool:
+        """Return True if the photo fits the spots of the others better mirrored."""
+        return fits_mirrored(self.found, self.held, self.nearby, means)
+
+
 def localize_nearby(
     scan_map: ScanMap, shot: Shot, alone: Result, located: Sequence[PoseGaussian], means: Means
-) -> Result | None:
+) -> FoundNearby | None:
     """Return the result of a photo within reach of others, whose poses in the map are known.
 
     None if there is no candidate place, or if it is not likelier than not, or the photo no surer than alone.
     """
+    found = look_nearby(scan_map, shot, alone, located, means)
+    if found is None or found.result.belief.best_place <= EVEN_ODDS:
+        return None
+    return found if found.result.confidence > alone.confidence and not found.fits_mirrored(means) else None
+
+
+def doubt_stray(
+    scan_map: ScanMap, shot: Shot, alone: Result, located: Sequence[PoseGaussian], means: Means
+) -> Result:
+    """Return the result of a photo that is sure by itself, but elsewhere than where others were taken.
+
+    It is that near the others, if this is likelier.
+    """
+    found = look_nearby(scan_map, shot, alone, located, means)
+    none_nearby = 1.0 if found is None else found.result.belief.place[-1]
+    there = none_nearby * share_elsewhere(compute_odds_elsewhere(scan_map, alone, take_poses(located)))
+    if found is not None and found.result.belief.best_place > there and not found.fits_mirrored(means):
+        return found.result
+    belief = alone.belief.scale(min(1.0, there / alone.belief.best_place))
+    return alone.take_belief(belief, shot.settings.demand.min_confidence)
+
+
+def look_nearby(
+    scan_map: ScanMap, shot: Shot, alone: Result, located: Sequence[PoseGaussian], means: Means
+) -> FoundNearby | None:
+    """Search a photo within reach of others and judge it there; None if there is no candidate place."""
     whole = prepare_search(scan_map, shot.panorama, shot.settings, means.watch)
     if whole is None:
         return None
-    poses = [one.pose for one in located]
+    poses = take_poses(located)
     near = narrow_around(whole.scan_map, poses)
     if len(near.sparse) == 0:
         return None
@@ -55,13 +96,24 @@ def localize_nearby(
         return None
     demand = shot.settings.demand
     nearby = Nearby(find_spots(located), len(near.sparse), demand.accuracy)
-    found, held = hold_at_spots(searched, nearby, means)
+    found, held = hold_at_spots(keep_near(searched, poses), nearby, means)
     elsewhere = compute_odds_elsewhere(scan_map, alone, poses)
     gain = len(whole.scan_map.sparse) / len(near.sparse)
     result = judge_nearby(found, held, elsewhere, gain, means, demand)
-    if result is None or result.belief.best_place <= EVEN_ODDS or result.confidence <= alone.confidence:
-        return None
-    return None if fits_mirrored(found, held, nearby, means) else result
+    return None if result is None else FoundNearby(result, found, held, nearby)
+
+
+def keep_near(found: Found, located: Sequence[Pose]) -> Found:
+    """Keep the poses of a photo within reach of others; all if none is: some were found by features."""
+    centers = np.array([one.pose.center_world for one in found.selection.candidates])
+    is_near = measure_distances(centers, located) <= REACH + COARSE_SPACING
+    near = list(compress(found.selection.candidates, is_near))
+    return found._replace(selection=found.selection.take(near)) if near else found
+
+
+def take_poses(located: Sequence[PoseGaussian]) -> list[Pose]:
+    """Return the poses without their errors."""
+    return [one.pose for one in located]
 
 
 def judge_nearby(

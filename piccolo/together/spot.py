@@ -1,10 +1,11 @@
-"""The spot where somebody stands and takes photos around: from sure photos follows where others were taken.
+"""The spot where somebody takes photos around: from sure photos follows where others were taken.
 
 A person turns about their own axis and holds the camera before them, as far out as an arm reaches. So a
 photo's position is that of the axis plus an offset that turns with the camera's heading. Axis, offset and how
-steadily both are kept are estimated from the photos that are sure; an offset of zero is a turn on the spot,
-and an unsteady one are a few steps. Bayesian linear regression, averaged over the deviations that may remain
-(Bishop, Pattern Recognition and Machine Learning, 2006, section 3.5).
+steadily both are kept are estimated from the photos that are sure; an offset of zero is a turn on the spot.
+Who walks straight on leaves the axis along one way only, and who takes a few steps leaves it to all sides.
+Bayesian linear regression, averaged over these ways and deviations (Bishop, Pattern Recognition and Machine
+Learning, 2006, section 3.5).
 """
 
 import math
@@ -21,7 +22,12 @@ LEAST_AT_SPOT = 3  # photos by which it is told how steadily somebody stands
 STEPS_APART = 1.0  # chosen: [m] from a photo to the nearest other that was taken at the same spot
 ARM = 0.4  # chosen: [m] deviation of the offset, ahead and to each side
 LEAST_LEVEL = 0.5  # part of the direction of view that is level, from which it tells the heading
-STEADINESSES = (0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28)  # [m] deviations that may remain, each as likely
+STEADINESSES = (0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28)  # [m] deviations of who stands, each as likely
+WALKS = 0.5  # chosen: probability that somebody walks straight on
+PACES = (0.5, 1.0)  # [m] deviations along that way, each as likely
+STRAIGHTNESSES = (0.02, 0.04, 0.08)  # [m] deviations from it, each as likely
+NUM_WAYS = 36  # level directions in which somebody may walk, each as likely
+ROUGH_MOVE = 0.3  # chosen: [m] deviation of a pose that the photo does not fix
 FREE = 1e3  # [m] deviation of the axis's position before any photo
 
 
@@ -33,11 +39,12 @@ class Positioned(NamedTuple):
 
 
 class Spot(NamedTuple):
-    """Axis and offset of somebody who takes photos, for each deviation that may remain."""
+    """Axis and offset of somebody who takes photos, for each way in which these may be kept."""
 
-    probabilities: Array  # (S,) of the deviations
+    probabilities: Array  # (S,) of the ways
     means: Array  # (S, 5) [m] the axis's position in the map, and the camera's offset ahead and to the left
     covariances: Array  # (S, 5, 5) [m^2]
+    spreads: Array  # (S, 3, 3) [m^2] covariances of positions about axis and offset
 
     @property
     def axis(self) -> Array:
@@ -50,9 +57,17 @@ class Spot(NamedTuple):
         centers = self.means @ A.T
         center = self.probabilities @ centers
         apart = centers - center
-        within = A @ self.covariances @ A.T + np.square(STEADINESSES)[:, None, None] * np.eye(3)
-        every = within + apart[:, :, None] * apart[:, None]
+        every = A @ self.covariances @ A.T + self.spreads + apart[:, :, None] * apart[:, None]
         return Positioned(center, np.tensordot(self.probabilities, every, 1))
+
+    def attract(self, R_cam_from_map: Array, found: Array) -> Pose:
+        """Return a pose with a rotation (3, 3) where it is expected, near where it was found (3,).
+
+        That position may be off by ROUGH_MOVE.
+        """
+        center, covariance = self.place(R_cam_from_map)
+        gain = covariance @ np.linalg.inv(covariance + ROUGH_MOVE**2 * np.eye(3))
+        return Pose(R_cam_from_map, center + gain @ (found - center))
 
 
 def differentiate_position(R_cam_from_map: Array) -> Array:
@@ -94,24 +109,35 @@ def fit_spot(located: Sequence[PoseGaussian]) -> Spot:
     centers = np.array([one.pose.center_world for one in located]) - origin
     A = np.array([differentiate_position(one.pose.R_cam_from_world) for one in located])
     errors = np.array([one.own[3:, 3:] for one in located])
+    priors, spreads = list_spreads(A[0, :2, 3])
     known = np.diag([FREE**-2] * 3 + [ARM**-2] * 2)
-    logs = []
-    means = []
-    covariances = []
-    for steadiness in STEADINESSES:
-        variances = errors + steadiness**2 * np.eye(3)
-        weights = np.linalg.inv(variances)
-        weighted = A.transpose(0, 2, 1) @ weights
-        information = known + (weighted @ A).sum(axis=0)
-        total = (weighted @ centers[..., None]).sum(axis=0)[:, 0]
-        mean = np.linalg.solve(information, total)
-        misfit = np.einsum("ki,kij,kj->", centers, weights, centers) - total @ mean
-        volumes = np.linalg.slogdet(variances)[1].sum() + np.linalg.slogdet(information)[1]
-        logs.append(-0.5 * (misfit + volumes))
-        means.append(np.concatenate([mean[:3] + origin, mean[3:]]))
-        covariances.append(np.linalg.inv(information))
-    likelihoods = np.exp(np.array(logs) - max(logs))
-    return Spot(likelihoods / likelihoods.sum(), np.array(means), np.array(covariances))
+    variances = errors + spreads[:, None]  # (S, K, 3, 3)
+    weights = np.linalg.inv(variances)
+    weighted = A.transpose(0, 2, 1) @ weights
+    information = known + (weighted @ A).sum(axis=1)
+    total = (weighted @ centers[..., None]).sum(axis=1)
+    means = np.linalg.solve(information, total)[..., 0]
+    misfits = np.einsum("ki,skij,kj->s", centers, weights, centers) - np.sum(total[..., 0] * means, axis=1)
+    volumes = np.linalg.slogdet(variances)[1].sum(axis=1) + np.linalg.slogdet(information)[1]
+    logs = np.log(priors) - 0.5 * (misfits + volumes)
+    likelihoods = np.exp(logs - logs.max())
+    means[:, :3] += origin
+    return Spot(likelihoods / likelihoods.sum(), means, np.linalg.inv(information), spreads)
+
+
+def list_spreads(heading: Array) -> tuple[Array, Array]:
+    """Return covariances (S, 3, 3) [m^2] of positions of who stands, or walks straight on, and priors (S,).
+
+    The ways of walking begin at a level direction (2,).
+    """
+    stands = np.square(STEADINESSES)[:, None, None] * np.eye(3)
+    angles = math.atan2(heading[1], heading[0]) + np.arange(NUM_WAYS) * (math.pi / NUM_WAYS)
+    ways = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(NUM_WAYS)])
+    along = np.square(PACES)[:, None, None, None] * (ways[:, :, None] * ways[:, None])
+    aside = np.square(STRAIGHTNESSES)[:, None, None, None, None] * np.eye(3)
+    walks = (along + aside).reshape(-1, 3, 3)
+    priors = [(1.0 - WALKS) / len(stands)] * len(stands) + [WALKS / len(walks)] * len(walks)
+    return np.array(priors), np.concatenate([stands, walks])
 
 
 def compute_density(position: Positioned, center: Array) -> float:
