@@ -20,16 +20,26 @@ from piccolo.judge.by_others import (
     believe_exact,
     believe_nearby,
     log_odds_nearby,
+    share_elsewhere,
     share_nearby,
 )
+from piccolo.judge.candidate import NO_CANDIDATE, Selection
 from piccolo.judge.reasons import Reason
-from piccolo.judge.result import nothing_found
+from piccolo.judge.result import Result, nothing_found
 from piccolo.judge.result_parts import Alternative
+from piccolo.localization.judging import Found
 from piccolo.localization.means import Means
 from piccolo.scan_map.camera_positions import COARSE_SPACING
 from piccolo.system.jobs.threads import Stopwatch
 from piccolo.together.members import Shot
-from piccolo.together.nearby import REACH, compute_odds_elsewhere, localize_nearby, narrow_around
+from piccolo.together.nearby import (
+    REACH,
+    compute_odds_elsewhere,
+    doubt_stray,
+    keep_near,
+    localize_nearby,
+    narrow_around,
+)
 
 TIER = "scene"
 
@@ -161,3 +171,38 @@ def test_a_spot_elsewhere_in_the_room_moves_no_photo_there():
     around = [Pose(R @ true_pose.R_cam_from_world, beside) for R in turns]
     found = _nearby(around, nothing_found(), 0.05)
     assert found is None or found.gaussian.pose.distance(true_pose) < 0.15 or found.confidence < 0.5
+
+
+@pytest.mark.parametrize(("offset", "is_moved"), [(0.0, True), (2.0, False)])
+def test_a_photo_sure_of_another_place_is_doubted_and_goes_to_the_others_if_it_fits_there(offset, is_moved):
+    """Others were taken at the true pose, or 2 m beside, where the photo does not fit."""
+    scan_map = rooms.scan_map(SEED)
+    shot = Shot(one_taken(1)[0], rooms.KNOWN)
+    true_pose = scan_map.from_world(one_taken(1)[1])
+    beside = true_pose.center_world + offset * np.array([0.6, 0.8, 0.0])
+    around = [Pose(yaw_rotation(turn) @ true_pose.R_cam_from_world, beside) for turn in (0.9, 2.1, 3.2, 4.4)]
+    far = scan_map.to_world(Pose(np.eye(3), true_pose.center_world + 9.0))
+    alone = Result(status="localized", best_pose=far, belief=make_belief([0.95]))
+    means = Means(rooms.KNOWN.effort, rooms.WORKERS, Stopwatch())
+    found = doubt_stray(scan_map, shot, alone, _measure(around), means)
+    if is_moved:
+        rooms.assert_near(scan_map.from_world(found.best_pose), true_pose, 0.05, 2.0)
+    else:
+        assert found.best_pose is far
+        assert found.status == "not_localized"
+        assert found.belief.place[0] == pytest.approx(share_elsewhere(19.0), abs=0.02)
+
+
+def test_a_place_far_from_others_needs_more_evidence():
+    assert share_elsewhere(0.0) == 0.0
+    assert share_elsewhere(5.0) == pytest.approx(0.5)
+    assert share_elsewhere(1e4) > 0.999
+
+
+def test_poses_out_of_reach_are_left_out_unless_there_are_no_others():
+    poses = [Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (2.6, 0.3, -0.9)]
+    first, *others = [replace(NO_CANDIDATE, pose=pose) for pose in poses]
+    found = Found(None, Selection(first, tuple(others)), None)
+    kept = keep_near(found, [Pose(np.eye(3), np.zeros(3))])
+    assert [one.pose for one in kept.selection.candidates] == poses[1:]
+    assert keep_near(found, [Pose(np.eye(3), np.full(3, 50.0))]) is found

@@ -146,3 +146,47 @@ def test_the_arm_turns_with_the_heading_and_stays_level(pitch_deg):
     A = differentiate_position(wrist @ yaw_rotation(0.9))
     np.testing.assert_allclose(A[:, 3:].T, yaw_rotation(0.9)[:2], atol=1e-12)
     np.testing.assert_array_equal(A[:, :3], np.eye(3))
+
+
+def _walk(rng, count):
+    """Poses of somebody who walks straight on and looks a little around, half a metre apart; and the way."""
+    heading = rng.uniform(0.0, math.tau)
+    way = np.array([math.cos(heading), math.sin(heading), 0.0])
+    poses = [
+        Pose(
+            yaw_rotation(heading + rng.uniform(-0.35, 0.35)), AXIS + 0.5 * k * way + rng.normal(0.0, 0.02, 3)
+        )
+        for k in range(count)
+    ]
+    return poses, way
+
+
+def test_who_walks_straight_on_is_expected_on_that_way():
+    """How far along is not told; how far beside is, to a few centimetres, about right."""
+    squares = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        poses, way = _walk(rng, 6)
+        *sure, asked = (poses[k] for k in rng.permutation(6)[:5])
+        center, covariance = fit_spot(_measure(rng, sure)).place(asked.R_cam_from_world)
+        beside = np.array([-way[1], way[0], 0.0])
+        offset = asked.center_world - center
+        squares.append(float(offset @ np.linalg.solve(covariance, offset)) / 3.0)
+        assert math.sqrt(beside @ covariance @ beside) < 0.2
+        assert math.sqrt(way @ covariance @ way) > 0.5
+    assert 0.4 < np.mean(squares) < 1.3
+
+
+def test_a_pose_is_attracted_across_the_way_and_hardly_along_it():
+    """Of who walks; who stands attracts it from all sides."""
+    rng = np.random.default_rng(9)
+    poses, way = _walk(rng, 6)
+    beside = np.array([-way[1], way[0], 0.0])
+    on_way = AXIS + 1.2 * way
+    walking = fit_spot(_measure(rng, poses))
+    attracted = walking.attract(poses[0].R_cam_from_world, on_way + 0.3 * beside)
+    assert abs((attracted.center_world - on_way) @ beside) < 0.06
+    assert abs((attracted.center_world - on_way) @ way) < 0.12
+    np.testing.assert_array_equal(attracted.R_cam_from_world, poses[0].R_cam_from_world)
+    standing = fit_spot(_measure(rng, _draw(rng, np.linspace(0.0, 6.0, 8), 0.0, 0.01)))
+    assert np.linalg.norm(standing.attract(np.eye(3), AXIS + 0.3).center_world - AXIS) < 0.06

@@ -1,0 +1,96 @@
+"""Which photos of a group help to find the rest, and which are doubted; without a scan."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from piccolo import CoarseToFineSettings
+from piccolo.geometry.pose import Pose, yaw_rotation
+from piccolo.geometry.pose_gaussian import PoseGaussian
+from piccolo.judge.belief import make_belief
+from piccolo.judge.result import Result
+from piccolo.together import group
+from piccolo.together.group import Grouped, list_strays, localize_rest
+from piccolo.together.members import Shot
+
+TIER = "pure"
+
+SURE = Result(status="localized", belief=make_belief([0.95]))
+UNSURE = Result(belief=make_belief([0.6]))
+
+
+def _gaussian(x):
+    """Where a photo was taken, by itself."""
+    errors = np.diag(np.repeat([1e-4, 2e-4], 3))
+    return PoseGaussian(Pose(yaw_rotation(x), np.array([x, 0.0, 0.0])), errors, np.zeros((6, 6)))
+
+
+def _sure_at(x, *others):
+    return Grouped(replace(SURE, gaussian=_gaussian(x)), others)
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """Let photos be found near the others from the round that is told for each; note who was asked for."""
+    calls = []
+    found_in = {}
+
+    def localize_nearby(scan_map, shot, alone, located, means):
+        number = shot.panorama
+        calls.append((number, len(located)))
+        sure_with, found_with = found_in[number]
+        result = SURE if len(located) >= sure_with else UNSURE
+        held = SimpleNamespace(alone=_gaussian(0.1 * number))
+        return SimpleNamespace(result=result, held=held) if len(located) >= found_with else None
+
+    def doubt_stray(scan_map, shot, alone, located, means):
+        calls.append((shot.panorama, len(located)))
+        return UNSURE
+
+    monkeypatch.setattr(group, "localize_nearby", localize_nearby)
+    monkeypatch.setattr(group, "doubt_stray", doubt_stray)
+    monkeypatch.setattr(group, "take_average", lambda result, *_: result)
+    return SimpleNamespace(calls=calls, found_in=found_in)
+
+
+def _localize(grouped):
+    shots = [Shot(number, CoarseToFineSettings()) for number in grouped]
+    return localize_rest(None, shots, grouped, None)
+
+
+def test_photos_that_are_sure_near_others_help_to_find_further_ones(asked):
+    grouped = {k: _sure_at(0.1 * k) for k in range(3)} | {k: Grouped(UNSURE, ()) for k in (3, 4, 5, 6)}
+    asked.found_in |= {3: (3, 3), 4: (4, 3), 5: (9, 3), 6: (4, 4)}
+    rest = _localize(grouped)
+    assert rest[3].result is rest[4].result is SURE
+    assert (rest[3].others, rest[4].others) == ((0, 1, 2), (0, 1, 2, 3))
+    assert rest[5].result is UNSURE
+    assert 6 not in rest, "who is not found at first is not asked again"
+    assert asked.calls == [(3, 3), (4, 3), (5, 3), (6, 3), (4, 4), (5, 4), (5, 5)]
+
+
+def test_without_news_nobody_is_asked_again(asked):
+    grouped = {k: _sure_at(0.1 * k) for k in range(3)} | {3: Grouped(UNSURE, ())}
+    asked.found_in[3] = (9, 0)
+    assert _localize(grouped)[3].result is UNSURE
+    assert asked.calls == [(3, 3)]
+
+
+def test_a_sure_photo_elsewhere_is_doubted_and_helps_nobody(asked):
+    grouped = {k: _sure_at(0.1 * k) for k in range(3)} | {3: _sure_at(8.0), 4: Grouped(UNSURE, ())}
+    asked.found_in[4] = (9, 9)
+    assert _localize(grouped)[3] == Grouped(UNSURE, ())
+    assert asked.calls == [(4, 3), (3, 3)]
+
+
+def test_one_that_is_there_together_with_another_is_not_doubted(asked):
+    grouped = {k: _sure_at(0.1 * k) for k in range(3)} | {3: _sure_at(8.0, 4), 4: _sure_at(8.2, 3)}
+    assert _localize(grouped)[3].result.status == "localized"
+    assert asked.calls == []
+
+
+@pytest.mark.parametrize(("positions", "strays"), [((0, 0.3, 0.6, 9), [3]), ((0, 0.3, 9), []), ((0, 9), [])])
+def test_photos_at_no_spot_are_strays_if_others_are_at_one(positions, strays):
+    assert list_strays({k: _gaussian(x) for k, x in enumerate(positions)}) == strays
