@@ -270,11 +270,29 @@ def compute_covariance(photo: PhotoImages, points: Cells, pose: Pose, profile: P
     return reduce(merge_covariances, found) if found else None
 
 
+def common_covariance(problem: Problem, pose: Pose, acting_range: float) -> Array:
+    """Return the covariance (6, 6) of errors of the scan, which all photos at a pose in the map share."""
+    of_scan = scan_covariance(problem.scan_map, acting_range)
+    return of_scan + layer_covariance(problem.scan_map, pose, acting_range)
+
+
+def grid_covariance(problem: Problem) -> Array:
+    """Return the covariance (6, 6) of errors of pixels and stitching, alike in all blocks.
+
+    Rows and columns that are displaced together turn the photo. How far they move it is among the errors of
+    its geometry: of its horizon or principal point.
+    """
+    prior = problem.given.focal_prior
+    method = problem.method
+    is_calibrated = prior is None or prior.deviation < UNCALIBRATED
+    turn = (method.pixel_share if is_calibrated else method.uncalibrated_share) * problem.pixel
+    return np.diag(np.repeat([turn**2, 0.0], 3))
+
+
 def split_errors(problem: Problem, pose: Pose, covariance: Array) -> PoseGaussian:
     """Return a pose in the map with its covariance (6, 6), split into errors of the scan and of the photo."""
     acting_range = compute_acting_range(problem.view_at(pose, "points"))
-    common = scan_covariance(problem.scan_map, acting_range)
-    common += layer_covariance(problem.scan_map, pose, acting_range)
+    common = common_covariance(problem, pose, acting_range)
     variances, axes = np.linalg.eigh(covariance - common)
     return PoseGaussian(pose, (axes * np.maximum(variances, TINY_VARIANCE)) @ axes.T, common)
 
@@ -333,20 +351,13 @@ def estimate_covariance(
         return UNKNOWN_ERRORS
     turned = pose.R_cam_from_world.T  # R_map_from_cam
     acting_range = compute_acting_range(points)
-    prior = problem.given.focal_prior
-    is_calibrated = prior is None or prior.deviation < UNCALIBRATED
-    method = problem.method
-    turn = (method.pixel_share if is_calibrated else method.uncalibrated_share) * problem.pixel
-    # of pixels and stitching, alike in all blocks: rows and columns that are displaced together turn the
-    # photo; how far they move it is among the errors of its geometry: of its horizon or principal point
-    of_grid = np.diag(np.repeat([turn**2, 0.0], 3))
-    own = turn_positions(covariance, turned) + of_grid
+    own = turn_positions(covariance, turned) + grid_covariance(problem)
     common = scan_covariance(problem.scan_map, acting_range)
     common = common + (1.0 - profile.own_share) * own
     own = profile.own_share * own
     std_of_fit = compute_std_of_fit(own + common, acting_range)
     if profile.compares_halves:
-        added = disagreement(photo, points, pose, covariance, method.halves_score, workers)
+        added = disagreement(photo, points, pose, covariance, problem.method.halves_score, workers)
         own = own + turn_positions(added, turned)
     common = common + layer_covariance(problem.scan_map, pose, acting_range)
     return Errors(PoseGaussian(pose, own, common), std_of_fit)

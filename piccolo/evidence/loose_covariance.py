@@ -10,13 +10,14 @@ from .blocks import block_gradients, sort_by_block, sum_by_block
 from .comparison import mask_occluders
 from .covariance import (
     LEAST_BLOCKS,
+    common_covariance,
     compute_acting_range,
     compute_hessian,
     few_blocks_factor,
+    grid_covariance,
     make_problem,
     remove_poles,
 )
-from .scan_errors import layer_covariance, scan_covariance
 
 FLAT_CURVATURE = 1e-3  # chosen: curvature of the loss in a direction, divided by the greatest
 FLAT_DEVIATION = 1.0  # [rad] in a flat direction, moves as seen from the acting range
@@ -50,10 +51,8 @@ def estimate_loosely(problem: Problem, candidate: Candidate) -> PoseGaussian | N
     num_flat, covariance = min(found, key=lambda one: (one[0], float(np.trace(one[1]))))
     if num_flat > MOST_FLAT:
         return None
-    common = scan_covariance(problem.scan_map, acting_range)
-    common = common + layer_covariance(problem.scan_map, pose, acting_range)
-    of_grid = np.diag(np.repeat([(problem.method.pixel_share * problem.pixel) ** 2, 0.0], 3))
-    return PoseGaussian(pose, turn_positions(covariance, pose.R_cam_from_world.T) + of_grid, common)
+    own = turn_positions(covariance, pose.R_cam_from_world.T) + grid_covariance(problem)
+    return PoseGaussian(pose, own, common_covariance(problem, pose, acting_range))
 
 
 def loose_covariance(
