@@ -81,7 +81,7 @@ def test_without_news_nobody_is_asked_again(asked):
 def test_a_sure_photo_elsewhere_is_doubted_and_helps_nobody(asked):
     grouped = {k: _sure_at(0.1 * k) for k in range(3)} | {3: _sure_at(8.0), 4: Grouped(UNSURE, ())}
     asked.found_in[4] = (9, 9)
-    assert _localize(grouped)[3] == Grouped(UNSURE, ())
+    assert _localize(grouped)[3] == Grouped(UNSURE, (0, 1, 2))
     assert asked.calls == [(4, 3), (3, 3)]
 
 

@@ -130,7 +130,7 @@ def localize_rest(
         located |= joined
     known = list(located.values())
     for k in strays:
-        rest[k] = Grouped(doubt_stray(scan_map, shots[k], sure[k], known, means), ())
+        rest[k] = Grouped(doubt_stray(scan_map, shots[k], sure[k], known, means), tuple(located))
     for k, mean in zip(located, average_each(known), strict=True):
         if k in sure:
             averaged = take_average(sure[k], mean, scan_map, shots[k].settings.demand)
