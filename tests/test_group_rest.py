@@ -45,7 +45,7 @@ def asked(monkeypatch):
         held = SimpleNamespace(alone=_gaussian(0.1 * number))
         return SimpleNamespace(result=result, held=held) if len(located) >= found_with else None
 
-    def doubt_stray(scan_map, shot, alone, located, means):
+    def doubt_stray(scan_map, shot, alone, located, num_strays, means):
         calls.append((shot.panorama, len(located)))
         return UNSURE
 

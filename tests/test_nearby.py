@@ -20,8 +20,8 @@ from piccolo.judge.by_others import (
     believe_exact,
     believe_nearby,
     log_odds_nearby,
-    share_elsewhere,
     share_nearby,
+    weigh_stray,
 )
 from piccolo.judge.candidate import NO_CANDIDATE, Selection
 from piccolo.judge.reasons import Reason
@@ -184,19 +184,22 @@ def test_a_photo_sure_of_another_place_is_doubted_and_goes_to_the_others_if_it_f
     far = scan_map.to_world(Pose(np.eye(3), true_pose.center_world + 9.0))
     alone = Result(status="localized", best_pose=far, belief=make_belief([0.95]))
     means = Means(rooms.KNOWN.effort, rooms.WORKERS, Stopwatch())
-    found = doubt_stray(scan_map, shot, alone, _measure(around), means)
+    found = doubt_stray(scan_map, shot, alone, _measure(around), 0, means)
     if is_moved:
         rooms.assert_near(scan_map.from_world(found.best_pose), true_pose, 0.05, 2.0)
     else:
         assert found.best_pose is far
         assert found.status == "not_localized"
-        assert found.belief.place[0] == pytest.approx(share_elsewhere(19.0), abs=0.02)
+        assert found.belief.place[0] == pytest.approx(weigh_stray(0.0, 19.0, 4, 0)[1], abs=0.02)
 
 
-def test_a_place_far_from_others_needs_more_evidence():
-    assert share_elsewhere(0.0) == 0.0
-    assert share_elsewhere(5.0) == pytest.approx(0.5)
-    assert share_elsewhere(1e4) > 0.999
+def test_a_place_far_from_others_needs_more_evidence_the_fewer_are_elsewhere():
+    far = [weigh_stray(0.0, 19.0, 6, count)[1] for count in (0, 2, 12)]
+    assert 0.85 < far[0] < far[1] < far[2] < 0.95
+    near, there = weigh_stray(40.0, 40.0, 8, 0)
+    assert near == pytest.approx(9.0 * there)
+    assert weigh_stray(0.0, 1e6, 8, 0)[1] > 0.999
+    assert weigh_stray(0.0, 0.0, 8, 0) == (0.0, 0.0)
 
 
 def test_poses_out_of_reach_are_left_out_unless_there_are_no_others():

@@ -72,10 +72,17 @@ def believe_nearby(near: Belief, elsewhere: float, gain: float) -> Belief:
     return replace(belief, ruled_out=near.ruled_out)
 
 
-def share_elsewhere(odds: float) -> float:
-    """Return the probability of a photo's places far from others, if it has none near them, by their odds."""
-    there = (1.0 - IS_NEARBY) * odds
-    return there / (1.0 + there)
+def weigh_stray(near: float, far: float, num_near: int, num_far: int) -> tuple[float, float]:
+    """Return the probabilities that a photo was taken at its places near others, and at its places far away.
+
+    `near` are the odds of the former if it was taken near the others, `far` those of the latter if it was
+    not. Before its evidence, it was as the other sure photos are, of which `num_near` are near each other and
+    `num_far` elsewhere (Laplace's rule of succession).
+    """
+    of_far = (num_far + 1.0) / (num_near + num_far + 2.0)
+    of_near = 1.0 - of_far
+    total = of_near * (near + MISSED) + of_far * (far + 1.0)
+    return of_near * near / total, of_far * far / total
 
 
 class NearbyShares(NamedTuple):

@@ -130,7 +130,8 @@ def localize_rest(
         located |= joined
     known = list(located.values())
     for k in strays:
-        rest[k] = Grouped(doubt_stray(scan_map, shots[k], sure[k], known, means), tuple(located))
+        doubted = doubt_stray(scan_map, shots[k], sure[k], known, len(strays) - 1, means)
+        rest[k] = Grouped(doubted, tuple(located))
     for k, mean in zip(located, average_each(known), strict=True):
         if k in sure:
             averaged = take_average(sure[k], mean, scan_map, shots[k].settings.demand)

@@ -16,7 +16,7 @@ from ..evidence.examine import examine
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
 from ..judge.belief import make_belief
-from ..judge.by_others import LEAST_NONE, believe_exact, believe_nearby, share_elsewhere
+from ..judge.by_others import LEAST_NONE, believe_exact, believe_nearby, weigh_stray
 from ..judge.probability import posterior
 from ..judge.result import Result
 from ..judge.selection import assess, credit_copies
@@ -40,6 +40,7 @@ class FoundNearby(NamedTuple):
     """A photo near others."""
 
     result: Result
+    odds: float  # of its places there, if it was taken there
     found: Found
     held: Held  # the pose of the result
     nearby: Nearby
@@ -63,18 +64,24 @@ def localize_nearby(
 
 
 def doubt_stray(
-    scan_map: ScanMap, shot: Shot, alone: Result, located: Sequence[PoseGaussian], means: Means
+    scan_map: ScanMap,
+    shot: Shot,
+    alone: Result,
+    located: Sequence[PoseGaussian],
+    num_strays: int,
+    means: Means,
 ) -> Result:
     """Return the result of a photo that is sure by itself, but elsewhere than where others were taken.
 
-    It is that near the others, if this is likelier.
+    It is that near the others, if this is likelier. `num_strays` other photos are sure elsewhere too.
     """
     found = look_nearby(scan_map, shot, alone, located, means)
-    none_nearby = 1.0 if found is None else found.result.belief.place[-1]
-    there = none_nearby * share_elsewhere(compute_odds_elsewhere(scan_map, alone, take_poses(located)))
-    if found is not None and found.result.belief.best_place > there and not found.fits_mirrored(means):
+    odds = 0.0 if found is None else found.odds
+    elsewhere = compute_odds_elsewhere(scan_map, alone, take_poses(located))
+    near, far = weigh_stray(odds, elsewhere, len(located), num_strays)
+    if found is not None and near > far and not found.fits_mirrored(means):
         return found.result
-    belief = alone.belief.scale(min(1.0, there / alone.belief.best_place))
+    belief = alone.belief.scale(min(1.0, far / alone.belief.best_place))
     return alone.take_belief(belief, shot.settings.demand.min_confidence)
 
 
@@ -99,8 +106,8 @@ def look_nearby(
     found, held = hold_at_spots(keep_near(searched, poses), nearby, means)
     elsewhere = compute_odds_elsewhere(scan_map, alone, poses)
     gain = len(whole.scan_map.sparse) / len(near.sparse)
-    result = judge_nearby(found, held, elsewhere, gain, means, demand)
-    return None if result is None else FoundNearby(result, found, held, nearby)
+    judged = judge_nearby(found, held, elsewhere, gain, means, demand)
+    return None if judged is None else FoundNearby(*judged, found, held, nearby)
 
 
 def keep_near(found: Found, located: Sequence[Pose]) -> Found:
@@ -118,8 +125,11 @@ def take_poses(located: Sequence[PoseGaussian]) -> list[Pose]:
 
 def judge_nearby(
     found: Found, held: Held, elsewhere: float, gain: float, means: Means, demand: Demand
-) -> Result | None:
-    """Return the result of a photo for the best of its poses near others; None if nothing fixes it."""
+) -> tuple[Result, float] | None:
+    """Return the result of a photo for the best of its poses near others; None if nothing fixes it.
+
+    Return also the odds of its places there, if it was taken there.
+    """
     if held.gaussian is None:
         return None
     problem, selection, fit = found
@@ -131,7 +141,8 @@ def judge_nearby(
     belief = replace(believe_nearby(near, elsewhere, gain), within=within)
     there = examine(problem, held.gaussian.pose)
     at_pose = Found(problem, reported.take([there, *reported.alternatives]), fit)
-    return judge_together(at_pose, held.gaussian, belief, means, demand.min_confidence)
+    result = judge_together(at_pose, held.gaussian, belief, means, demand.min_confidence)
+    return result, gain * (1.0 - near.place[-1]) / max(near.place[-1], LEAST_NONE)
 
 
 def compute_odds_elsewhere(scan_map: ScanMap, alone: Result, located: Sequence[Pose]) -> float:
