@@ -108,6 +108,7 @@ def test_the_position_of_a_turned_photo_follows_the_arm():
     end = turn_at(problem, start, spot)
     expected = spot.attract(end.R_cam_from_world, start.center_world)
     np.testing.assert_array_equal(end.center_world, expected.center_world)
+    assert np.linalg.norm(end.center_world - spot.place(end.R_cam_from_world).center) < 0.01
     rooms.assert_near(end, true_pose, 0.03, 1.0)
 
 

@@ -152,12 +152,10 @@ def _walk(rng, count):
     """Poses of somebody who walks straight on and looks a little around, half a metre apart; and the way."""
     heading = rng.uniform(0.0, math.tau)
     way = np.array([math.cos(heading), math.sin(heading), 0.0])
-    poses = [
-        Pose(
-            yaw_rotation(heading + rng.uniform(-0.35, 0.35)), AXIS + 0.5 * k * way + rng.normal(0.0, 0.02, 3)
-        )
-        for k in range(count)
-    ]
+    poses = []
+    for k in range(count):
+        center = AXIS + 0.5 * k * way + rng.normal(0.0, 0.02, 3)
+        poses.append(Pose(yaw_rotation(heading + rng.uniform(-0.35, 0.35)), center))
     return poses, way
 
 

@@ -57,7 +57,8 @@ def localize_nearby(
 
     None if there is no candidate place, or if it is not likelier than not, or the photo no surer than alone.
     """
-    found = look_nearby(scan_map, shot, alone, located, means)
+    elsewhere = compute_odds_elsewhere(scan_map, alone, take_poses(located))
+    found = look_nearby(scan_map, shot, elsewhere, located, means)
     if found is None or found.result.belief.best_place <= EVEN_ODDS:
         return None
     return found if found.result.confidence > alone.confidence and not found.fits_mirrored(means) else None
@@ -75,9 +76,9 @@ def doubt_stray(
 
     It is that near the others, if this is likelier. `num_strays` other photos are sure elsewhere too.
     """
-    found = look_nearby(scan_map, shot, alone, located, means)
-    odds = 0.0 if found is None else found.odds
     elsewhere = compute_odds_elsewhere(scan_map, alone, take_poses(located))
+    found = look_nearby(scan_map, shot, elsewhere, located, means)
+    odds = 0.0 if found is None else found.odds
     near, far = weigh_stray(odds, elsewhere, len(located), num_strays)
     if found is not None and near > far and not found.fits_mirrored(means):
         return found.result
@@ -86,9 +87,12 @@ def doubt_stray(
 
 
 def look_nearby(
-    scan_map: ScanMap, shot: Shot, alone: Result, located: Sequence[PoseGaussian], means: Means
+    scan_map: ScanMap, shot: Shot, elsewhere: float, located: Sequence[PoseGaussian], means: Means
 ) -> FoundNearby | None:
-    """Search a photo within reach of others and judge it there; None if there is no candidate place."""
+    """Search a photo within reach of others and judge it there; None if there is no candidate place.
+
+    `elsewhere` are the odds of its places beyond reach, as of `compute_odds_elsewhere`.
+    """
     whole = prepare_search(scan_map, shot.panorama, shot.settings, means.watch)
     if whole is None:
         return None
@@ -104,7 +108,6 @@ def look_nearby(
     demand = shot.settings.demand
     nearby = Nearby(find_spots(located), len(near.sparse), demand.accuracy)
     found, held = hold_at_spots(keep_near(searched, poses), nearby, means)
-    elsewhere = compute_odds_elsewhere(scan_map, alone, poses)
     gain = len(whole.scan_map.sparse) / len(near.sparse)
     judged = judge_nearby(found, held, elsewhere, gain, means, demand)
     return None if judged is None else FoundNearby(*judged, found, held, nearby)
