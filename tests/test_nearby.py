@@ -34,6 +34,7 @@ from piccolo.system.jobs.threads import Stopwatch
 from piccolo.together.members import Shot
 from piccolo.together.nearby import (
     REACH,
+    TAKEN_ELSEWHERE,
     compute_odds_elsewhere,
     doubt_stray,
     keep_near,
@@ -190,6 +191,7 @@ def test_a_photo_sure_of_another_place_is_doubted_and_goes_to_the_others_if_it_f
     else:
         assert found.best_pose is far
         assert found.status == "not_localized"
+        assert found.warnings == (TAKEN_ELSEWHERE,)
         assert found.belief.place[0] == pytest.approx(weigh_stray(0.0, 19.0, 4, 0)[1], abs=0.02)
 
 

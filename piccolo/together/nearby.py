@@ -33,6 +33,9 @@ from .bundle import EVEN_ODDS
 from .members import Shot
 from .spot import find_spots
 
+TAKEN_ELSEWHERE = (
+    "the photo fits best elsewhere than the others were taken: less sure with them than by itself"
+)
 REACH = 1.0  # chosen: [m] from the nearest photo of those that were taken together
 
 
@@ -83,7 +86,8 @@ def doubt_stray(
     if found is not None and near > far and not found.fits_mirrored(means):
         return found.result
     belief = alone.belief.scale(min(1.0, far / alone.belief.best_place))
-    return alone.take_belief(belief, shot.settings.demand.min_confidence)
+    doubted = alone.take_belief(belief, shot.settings.demand.min_confidence)
+    return replace(doubted, warnings=(*doubted.warnings, TAKEN_ELSEWHERE))
 
 
 def look_nearby(
