@@ -33,9 +33,7 @@ from .bundle import EVEN_ODDS
 from .members import Shot
 from .spot import find_spots
 
-TAKEN_ELSEWHERE = (
-    "the photo fits best elsewhere than the others were taken: less sure with them than by itself"
-)
+TAKEN_ELSEWHERE = "the photo fits best where none of the others was taken: with them it is less sure"
 REACH = 1.0  # chosen: [m] from the nearest photo of those that were taken together
 
 
