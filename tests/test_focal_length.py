@@ -189,16 +189,19 @@ def test_matches_lead_to_a_focal_length_that_is_far_off():
     assert follow_matches(problem, found, rooms.WORKERS) == (problem, found)
 
 
-def test_the_lowest_end_of_descents_from_several_starts_is_taken(monkeypatch):
+def test_the_lowest_end_of_descents_is_first_and_the_others_scatter_about_it(monkeypatch):
     def descend(cells, image, freedom, pose, values, limits):
-        return SimpleNamespace(loss=abs(values[0] - 0.28), start=(pose, values))
+        return SimpleNamespace(loss=abs(values[0] - 0.28), values=values)
 
     monkeypatch.setattr(focal, "descend_freely", descend)
     shown = SimpleNamespace(photo=SimpleNamespace(image=lambda name: name))
     points = Cells(np.ones((3, 402)), np.ones((3, 402)), np.ones(402), np.zeros(3))
     descents = focal.LensDescents(shown, np.ones((4, 8), bool), Workers(1))
     starts = [(ELSEWHERE, np.full(5, value)) for value in (0.0, 0.1, 0.3, 0.5)]
-    assert descents.find_lowest(points, None, starts).start[1] is starts[2][1]
+    ends = descents.find_ends(points, None, starts)
+    assert [end.values[0] for end in ends] == [0.3, 0.1, 0.5, 0.0]
+    assert focal.compute_scatter(ends) == pytest.approx((0.2**2 + 0.2**2 + 0.3**2) / 4)
+    assert focal.compute_scatter(ends[:1]) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from piccolo.together import group, members, mirrored
 from piccolo.together.bundle_search import Support
 from piccolo.together.expected import Expected
 from piccolo.together.group import localize_group, weigh_supports
-from piccolo.together.links import FIRM, WEAK, Links, Placed, compute_shared, find_links, list_pairs, spread
+from piccolo.together.links import FIRM, WEAK, Links, Placed, compute_new, find_links, list_pairs, spread
 from piccolo.together.members import Shot
 from piccolo.together.optima import spread_optima
 
@@ -95,13 +95,15 @@ def _show_the_same(*headings_deg):
 
 
 @pytest.mark.parametrize(
-    ("turned_deg", "least", "most"), [(0.0, 0.95, 1.0), (30.0, 0.3, 0.7), (90.0, 0.0, 0.0)]
+    ("turned_deg", "least", "most"),
+    [((0.0,), 0.0, 0.05), ((30.0,), 0.3, 0.7), ((30.0, -30.0), 0.0, 0.1), ((90.0,), 1.0, 1.0)],
 )
-def test_what_photos_show_in_common_is_told_by_their_keypoints(turned_deg, least, most):
-    links, places = _show_the_same(0.0, turned_deg)
-    assert least <= compute_shared(links, places, 0) <= most
+def test_what_other_photos_do_not_show_is_told_by_keypoints(turned_deg, least, most):
+    """Two photos together may show all that another does."""
+    links, places = _show_the_same(0.0, *turned_deg)
+    assert least <= compute_new(links, places, 0) <= most
     nothing = {**places, 0: places[0]._replace(ranges=np.zeros_like(places[0].ranges))}
-    assert compute_shared(links, nothing, 0) == 0.0, "a bare wall is not known to be shown twice"
+    assert compute_new(links, nothing, 0) == 1.0, "a bare wall is not known to be shown twice"
 
 
 def test_what_several_photos_show_counts_once_and_not_less():
@@ -113,8 +115,8 @@ def test_what_several_photos_show_counts_once_and_not_less():
     weights = {k: one.weight for k, one in tested.supports.items()}
     assert list(weights) == [0, 1, 2, 3]
     assert weights[1] == 1.0
-    assert weights[0] == pytest.approx(1.0 / 2.0, abs=0.02)
-    assert weights[2] == pytest.approx(1.0 / 3.0, abs=0.02)
+    assert weights[0] == pytest.approx(0.0, abs=0.05)
+    assert weights[2] == pytest.approx(0.0, abs=0.05)
     assert weights[3] == 1.0, "it shows something else"
 
 
@@ -127,7 +129,7 @@ def test_places_are_compared_by_the_same_evidence():
     weights = [{k: one.weight for k, one in at.supports.items()} for at in tested]
     assert weights[0] == weights[1]
     assert weights[2] == {1: weights[0][1]}
-    assert weights[0][0] == pytest.approx(0.75, abs=0.02)
+    assert weights[0][0] == pytest.approx(0.5, abs=0.02)
     assert [one.odds for one in tested[0].supports.values()] == [2.0, 100.0]
 
 

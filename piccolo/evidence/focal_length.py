@@ -149,10 +149,10 @@ def fit_focal(problem: Problem, best: Candidate, workers: Workers, is_first: boo
     claim = make_claim(prior, camera)
     matches = list_matches(problem, best, workers)
     starts = fit_matches(problem.method, mount, best.pose, matches, ALL_WIDTHS)
-    near, far = descend_lens(problem, best, claim, starts, workers, is_first)
+    near, far, scatter = descend_lens(problem, best, claim, starts, workers, is_first)
     by_matches = fit_matches(problem.method, mount, best.pose, matches, FOCAL_WIDTHS)
-    estimate = estimate_lens(problem, best.pose, near, by_matches)
-    return weigh_claim(prior, camera, estimate, estimate_lens(problem, best.pose, far))
+    estimate = estimate_lens(problem, best.pose, near, scatter, by_matches)
+    return weigh_claim(prior, camera, estimate, estimate_lens(problem, best.pose, far, scatter))
 
 
 def weigh_claim(prior: FocalPrior, camera: Camera, estimate: LensEstimate, free: LensEstimate) -> FocalFit:
@@ -264,10 +264,12 @@ class LensDescents(NamedTuple):
         """Descend on points from a pose and corrections."""
         return descend_freely(points, self.shown.photo.image("full"), freedom, *start, CLOSE)
 
-    def find_lowest(self, points: Cells, freedom: Freedom, starts: Sequence[tuple[Pose, Array]]) -> FreeEnd:
-        """Return the lowest end of descents on points from several starts."""
+    def find_ends(
+        self, points: Cells, freedom: Freedom, starts: Sequence[tuple[Pose, Array]]
+    ) -> list[FreeEnd]:
+        """Return the ends of descents on points from several starts, the lowest first."""
         ends = self.workers.map(partial(self.go_on, points, freedom), starts, "fit the focal length")
-        return min(ends, key=lambda end: end.loss)
+        return sorted(ends, key=lambda end: end.loss)
 
 
 def descend_lens(
@@ -277,13 +279,14 @@ def descend_lens(
     by_matches: MatchFit,
     workers: Workers,
     is_first: bool,
-) -> tuple[FreeEnd, FreeEnd]:
+) -> tuple[FreeEnd, FreeEnd, float]:
     """Descend with the focal length free, then with all corrections of the lens; return both lowest ends.
 
-    The descents of the focal length begin with that of the last fit and, in a first fit, with others too. The
-    descents of all corrections begin at the end of the former, and at the fit to the matches. The focal
-    length descends again with the points that are seen from its end: points that are seen from another pose
-    favour that pose.
+    The third value is the scatter (see `compute_scatter`) of the focal length's logarithm among ends near
+    each other. The descents of the focal length begin with that of the last fit and, in a first fit, with
+    others too. The descents of all corrections begin at the end of the former, and at the fit to the
+    matches. The focal length descends again with the points that are seen from its end: points that are seen
+    from another pose favour that pose.
     """
     pose = best.pose
     shown = problem.show(mask_occluders(problem, best.comparison, best.unoccluded).photo)
@@ -297,15 +300,27 @@ def descend_lens(
     others = workers.map(begin, FIRST_CHANGES, "fit the focal length") if is_first else []
     points = descents.find_points(pose)
     starts = [(pose, np.zeros(len(LENS))), *(end.start for end in others)]
-    first = descents.find_lowest(points, of_focal, starts)
-    near = descents.find_lowest(points, of_focal, start_beside(first))
+    first = descents.find_ends(points, of_focal, starts)[0]
+    beside = descents.find_ends(points, of_focal, start_beside(first))
+    near = beside[0]
     for _ in range(NUM_FOCAL_VIEWS):
         if near.pose.distance(pose) > FAR_AWAY:
             break
         near = descents.go_on(descents.find_points(near.pose), of_focal, near.start)
     points = descents.find_points(near.pose)
     starts = [near.start, (by_matches.pose, by_matches.values)]
-    return near, descents.find_lowest(points, of_all, starts[: 1 + int(by_matches.values.any())])
+    far = descents.find_ends(points, of_all, starts[: 1 + int(by_matches.values.any())])[0]
+    return near, far, compute_scatter(beside)
+
+
+def compute_scatter(ends: Sequence[FreeEnd]) -> float:
+    """Return the mean square of how far ends of descents lie from the first in the focal length's logarithm.
+
+    The loss is rough at a minimum, and its curvature there does not tell by how much: another picture of the
+    same place would have had another of these ends as its lowest.
+    """
+    values = np.array([end.values[FOCAL] for end in ends])
+    return float(np.square(values - values[0]).mean())
 
 
 def start_beside(end: FreeEnd) -> list[tuple[Pose, Array]]:
@@ -328,12 +343,13 @@ def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
 
 
 def estimate_lens(
-    problem: Problem, pose: Pose, end: FreeEnd, by_matches: MatchFit | None = None
+    problem: Problem, pose: Pose, end: FreeEnd, scatter: float, by_matches: MatchFit | None = None
 ) -> LensEstimate:
     """Estimate the corrections of a lens at the end of a descent from a pose.
 
     A descent that ended far from the pose gives no information. Errors of the picture's edge are added, which
-    all blocks may share, and errors of the scan, which the matches share too.
+    all blocks may share, the `scatter` of the focal length among the ends of descents, and errors of the
+    scan, which the matches share too.
     """
     estimate = estimate_corrections(end)
     if end.pose.distance(pose) > FAR_AWAY:
@@ -341,6 +357,8 @@ def estimate_lens(
     camera = problem.given.cameras[0].camera
     per_px = math.tau * camera.focal[0] / (0.5 * camera.width * problem.photo.panorama.rgb.shape[1])
     estimate = add_errors(estimate, (problem.method.edge_error * per_px) ** 2 * np.eye(len(LENS)))
+    is_focal = np.arange(len(LENS)) == FOCAL
+    estimate = add_errors(estimate, scatter * np.diag(is_focal))
     if by_matches is not None:
         estimate = add_matches(estimate, by_matches)
     acting_range = compute_acting_range(problem.view_at(pose, "points"))

@@ -30,17 +30,7 @@ from .at_spot import average_each
 from .bundle import EVEN_ODDS, judge_placed, place_between
 from .bundle_search import NUM_BUNDLES, Support, find_supports, weigh_bundles
 from .expected import locate_all
-from .links import (
-    FIRM,
-    WEAK,
-    Links,
-    Placed,
-    Places,
-    are_bridged,
-    compute_shared,
-    find_links,
-    spread,
-)
+from .links import FIRM, WEAK, Links, Placed, Places, are_bridged, compute_new, find_links, spread
 from .members import Member, Shot, find_members
 from .mirrored import refuse_mirrored
 from .nearby import doubt_stray, localize_nearby
@@ -290,12 +280,12 @@ def weigh_supports(links: Links, tested: Sequence[Tested]) -> list[Tested]:
 
 
 def weigh_at(links: Links, tested: Tested) -> dict[int, float]:
-    """Return the weights of the photos by what they show at one place."""
+    """Return the weights of the photos at one place: the shares that no photo with more odds shows."""
     counted: dict[int, Placed] = {}
     weights: dict[int, float] = {}
     for number in sorted(tested.supports, key=lambda k: (-tested.supports[k].odds, k)):
         counted[number] = tested.places[number]
-        weights[number] = 1.0 / (1.0 + compute_shared(links, counted, number))
+        weights[number] = compute_new(links, counted, number)
     return weights
 
 

@@ -191,19 +191,19 @@ def are_bridged(links: Links, one: Places, other: Places) -> bool:
     return max(counts, default=0) >= LEAST_BRIDGE
 
 
-def compute_shared(links: Links, places: Places, number: int) -> float:
-    """Return by how many other photos a photo's content is shown, in the mean: 1 if one other shows all."""
+def compute_new(links: Links, places: Places, number: int) -> float:
+    """Return the share of a photo's content that no other of several photos shows; 1 if nothing is known."""
     pose, ranges = places[number]
     is_seen = ranges > 0.0
     if not is_seen.any():
-        return 0.0
+        return 1.0
     rays = links.keypoints[number].rays[is_seen].astype(np.float64)
     points = pose.center_world + ranges[is_seen, None] * rotate_points(rays, pose.R_cam_from_world.T)
-    shares = []
+    is_new = np.ones(len(points), bool)
     for other, at in places.items():
         if other != number:
             offsets = rotate_points(points - at.pose.center_world, at.pose.R_cam_from_world)
             distances = np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-9)
             is_valid = links.problems[other].photo.panorama.is_valid
-            shares.append(is_valid[compute_indices(offsets / distances, is_valid.shape[1])].mean())
-    return float(sum(shares))
+            is_new &= ~is_valid[compute_indices(offsets / distances, is_valid.shape[1])]
+    return float(is_new.mean())
