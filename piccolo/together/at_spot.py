@@ -61,6 +61,7 @@ class Held(NamedTuple):
     shares: NearbyShares  # of its place
     exact: NearbyErrors
     std_of_fit: float | None  # by the photo alone: as `Errors` has it
+    is_turned: bool = False  # the photo was turned at the spot: where it is follows from the others
 
     def moves_by(self, pose: Pose) -> float:
         """Return how far it is from a pose [m]; infinitely far if nothing fixes it."""
@@ -168,8 +169,8 @@ def hold_at_spots(found: Found, nearby: Nearby, means: Means) -> tuple[Found, He
     asked = [one for one in candidates[:NUM_HELD] if one.score >= least]
     every = [hold_best(found, one, nearby, workers) for one in asked]
     every += [nearby.take_elsewhere(one) for one in candidates if not any(one is other for other in asked)]
-    if not any(one.shares.of_spot > EVEN_ODDS for one in every):
-        every += search_at_spots(found, nearby, means)
+    if not any(one.shares.of_spot > EVEN_ODDS and not one.is_turned for one in every):
+        every += search_at_spots(found, nearby, means)  # one that was turned there may fit better turned away
     standings = assess(problem.profile, Selection(every[0].candidate, tuple(h.candidate for h in every[1:])))
     order = np.argsort([-log_odds(standing, problem.method) for standing in standings], kind="stable")
     best, *others = suppress_near([every[k].candidate for k in order], len(every), ONE_ANSWER)
@@ -201,12 +202,16 @@ def hold_best(found: Found, candidate: Candidate, nearby: Nearby, workers: Worke
 def hold_turned(
     problem: Problem, start: Pose, spot: Spot, nearby: Nearby, least_score: float, workers: Workers
 ) -> Held | None:
-    """Return the pose of a photo that does not fix it, near a start; None if it does not fit at the spot."""
+    """Return the pose of a photo that does not fix it, near a start; None if it does not fit at the spot.
+
+    That it is near the spot, where it began, is no evidence against a local optimum.
+    """
     turned = examine(problem, refine(problem, start, workers, FULL).pose)
     if turned.score < least_score:
         return None
     alone = estimate_loosely(problem, turned)
-    return None if alone is None else nearby.hold(turned, alone, spot, None)
+    held = None if alone is None else nearby.hold(turned, alone, spot, None)
+    return held and held._replace(is_turned=True, exact=held.exact._replace(likelihood_ratio=1.0))
 
 
 def search_at_spots(found: Found, nearby: Nearby, means: Means) -> list[Held]:
