@@ -121,6 +121,8 @@ def test_a_photo_is_turned_only_where_it_fits():
     rooms.assert_near(held.gaussian.pose, true_pose, 0.04, 1.0)
     assert held.candidate.log_by_others > 2.0
     assert held.gaussian.largest_std < 0.1
+    assert held.is_turned
+    assert held.exact.likelihood_ratio == 1.0, "it began there"
     beside = _spot(true_pose.center_world + np.array([0.7, 0.4, 0.0]))
     start = turn_at(problem, true_pose, beside)
     assert hold_turned(problem, start, beside, _nearby(beside), 0.9 * best.score, rooms.WORKERS) is None
@@ -232,3 +234,23 @@ def test_a_mean_far_from_where_a_photo_was_found_is_turned_instead(monkeypatch):
     assert held.std_of_fit is None
     assert held.moves_by(beside) > 0.1
     assert here.take_elsewhere(candidate).moves_by(beside) == math.inf
+
+
+@pytest.mark.parametrize(("std", "is_searched"), [(0.3, True), (0.01, False)])
+def test_other_rotations_are_searched_unless_the_photo_itself_tells_that_it_is_at_the_spot(
+    monkeypatch, std, is_searched
+):
+    """One that was turned there may fit better turned away."""
+    problem, true_pose = _photo()
+    off = 0.25 if is_searched else 0.0
+    pose = Pose(true_pose.R_cam_from_world, true_pose.center_world + np.array([off, 0.0, 0.0]))
+    asked = []
+    monkeypatch.setattr(at_spot, "estimate_pose_errors", lambda *_: Errors(_gaussian(pose, std), 0.01))
+    monkeypatch.setattr(at_spot, "spread_optima", lambda *_: np.zeros((6, 6)))
+    monkeypatch.setattr(at_spot, "search_at_spots", lambda *given: asked.append(given) or [])
+    found = Found(problem, Selection(examine(problem, pose), ()), None)
+    nearby = _nearby(_spot(true_pose.center_world))
+    _, held = hold_at_spots(found, nearby, rooms.means(rooms.KNOWN))
+    assert held.shares.of_spot > 0.5
+    assert held.is_turned == is_searched
+    assert len(asked) == is_searched
