@@ -9,6 +9,7 @@ import rooms
 import tiers
 from batches import COARSE
 from consistency import contradictions_of_line, find_contradictions, lines_of_results
+from hypothesis import settings
 from once import search_alone_once, search_photos_once
 
 from piccolo.cloud.readers import e57, las, mesh, reader, text
@@ -21,6 +22,10 @@ from piccolo.together.coloring import alignment, passersby
 # A shell starts what runs in the background with Ctrl-C ignored, as then would be what a test starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+
+# How long an example takes says how busy the machine is, and if something was compiled.
+settings.register_profile("any machine", deadline=None)
+settings.load_profile("any machine")
 
 # The files that take longest begin first, so that in the end no worker waits for another. Before them one
 # worker runs what compiles most kernels, and the other what needs none, so that none is compiled twice.

@@ -194,7 +194,7 @@ def test_damaged_rigs_are_refused(tmp_path, content, message):
     assert_refused(message, read_rig, write(tmp_path / "a.json", content))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(data=st.data())
 @pytest.mark.parametrize("name", ["cameras.txt", "ours.json", "opensfm.json", "rig.json"])
 def test_mutated_files_are_read_or_refused(name, data, tmp_path_factory):
@@ -214,7 +214,7 @@ def test_mutated_files_are_read_or_refused(name, data, tmp_path_factory):
 ANY = st.one_of(st.floats(-3.0, 3.0), st.floats(-1e6, 1e6), st.just(0.0))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(data=st.data())
 def test_any_camera_that_is_taken_can_be_resampled(data):
     """Whatever the numbers: what they can't show is not valid, and what is has a pixel."""

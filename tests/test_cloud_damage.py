@@ -54,7 +54,7 @@ CONTENTS = {
 
 
 @pytest.mark.parametrize("name", CONTENTS)
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(data=st.data())
 def test_mutated_files_are_read_or_refused(name, data, tmp_path_factory):
     content = CONTENTS[name]
@@ -294,7 +294,7 @@ def few_points():
 
 @pytest.mark.usefixtures("few_points")
 @pytest.mark.parametrize("name", MESHES)
-@settings(deadline=None, max_examples=40, derandomize=True)
+@settings(max_examples=40, derandomize=True)
 @given(data=st.data())
 def test_mutated_meshes_raise_nothing_but_input_error(name, data, tmp_path_factory):
     path = MESHES[name](tmp_path_factory.getbasetemp())

@@ -261,7 +261,7 @@ def read_all(path):
     return read(path)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(data=st.data(), is_sealed=st.booleans())
 def test_mutated_files_raise_nothing_but_input_error(tmp_path_factory, data, is_sealed):
     folder = tmp_path_factory.getbasetemp()

@@ -37,7 +37,7 @@ def test_morton_codes_equal_twin():
     assert codes[1] == (1 << 63) - 1
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), step=st.sampled_from([0.0, 0.01, 0.5, 3.0]))
 def test_shuffling_points_changes_no_bit(seed, step, tmp_path_factory):
     raw = seeded_cloud(seed, step=step)

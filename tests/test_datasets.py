@@ -276,7 +276,7 @@ def dataset(request, tmp_path_factory):
     return request.param, folder, folder / name, content.encode()
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damaged_files_are_read_or_refused(dataset, data):
     name, folder, path, content = dataset

@@ -128,7 +128,6 @@ def test_a_pixel_that_is_no_number_is_no_index():
     assert not np.isfinite(nearest_depth(nothing, Pose(I, HERE), 64)).any()
 
 
-@settings(deadline=None)  # it is compiled
 @given(st.floats(-0.5, 60_000.0, width=32))
 def test_the_whole_part_of_a_pixel_is_as_before(u):
     assert whole(np.float32(u)) == int(u)

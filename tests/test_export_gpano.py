@@ -143,7 +143,7 @@ def test_refusals(tmp_path):
 
 
 @given(st.data())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_any_damage_of_a_picture_is_refused_or_copied(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("damaged") / "a.jpg"
     whole = _with_segments(jpeg(path, (64, 32)), _segment(XMP_MARK + CAMERA_PACKET))

@@ -232,7 +232,7 @@ def test_damaged_results_are_refused_with_file_and_line(tmp_path):
 
 
 @given(st.data())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_any_damage_of_results_is_refused_or_harmless(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("damaged") / "r.jsonl"
     content = (MIXED[0].to_json() + "\n").encode() * 2

@@ -177,7 +177,7 @@ def test_paths_that_are_no_picture_are_refused(tmp_path, monkeypatch):
     assert_refused(r"cannot be read \(Permission denied\)", read_panorama, write(tmp_path / "a.png", PNG))
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(data=st.data())
 def test_mutated_png_with_right_checksums_is_read_or_refused(data, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / "mutated.png"

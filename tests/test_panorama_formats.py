@@ -261,7 +261,7 @@ def check(path):
 
 @pytest.mark.process
 @pytest.mark.parametrize("content", FILES.values(), ids=FILES)
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(data=st.data())
 def test_mutated_files_are_read_or_refused(content, data, tmp_path_factory):
     begin = data.draw(st.integers(0, len(content) // 2))
@@ -271,7 +271,7 @@ def test_mutated_files_are_read_or_refused(content, data, tmp_path_factory):
 
 @pytest.mark.process
 @pytest.mark.parametrize("name", ["tiff", "tiff, 16 bits, big end", "tiff, packed by 5", "tiff, packed by 8"])
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(data=st.data())
 def test_tiffs_with_mutated_tags_are_read_or_refused(name, data, tmp_path_factory):
     content = bytearray(FILES[name])
@@ -290,7 +290,7 @@ def test_tiffs_with_mutated_tags_are_read_or_refused(name, data, tmp_path_factor
     check(write(tmp_path_factory.getbasetemp() / "mutated.tif", bytes(content)))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(data=st.data())
 def test_mutated_metadata_is_read_or_refused(data, tmp_path_factory):
     """Over checksums, which would else refuse nearly all."""
@@ -303,7 +303,7 @@ def test_mutated_metadata_is_read_or_refused(data, tmp_path_factory):
     check(write(tmp_path_factory.getbasetemp() / "a", jpeg))
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(data=st.data())
 def test_mutated_masks_are_read_or_refused(data, tmp_path_factory):
     folder = tmp_path_factory.getbasetemp()

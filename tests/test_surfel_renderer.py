@@ -234,7 +234,7 @@ def test_few_points_are_drawn_and_pictures_too_large_refused():
 
 
 @given(st.floats(0, 359.9), st.floats(-89, 89), st.floats(-179, 179))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_angles_turn_the_camera_as_exports_read_it(heading, pitch, roll):
     R_cam_from_world = R_cam_from_angles(heading, pitch, roll)
     back = heading_pitch_roll_deg(Pose(R_cam_from_world, np.zeros(3)))
@@ -243,7 +243,7 @@ def test_angles_turn_the_camera_as_exports_read_it(heading, pitch, roll):
 
 
 @given(st.data())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_a_pose_file_is_read_or_refused(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("pose") / "T.txt"
     pose = poses.tilted_poses(1)[0]
