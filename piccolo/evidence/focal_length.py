@@ -356,9 +356,9 @@ def estimate_lens(
         estimate = inform(estimate, np.zeros_like(estimate.by_picture.information))
     camera = problem.given.cameras[0].camera
     per_px = math.tau * camera.focal[0] / (0.5 * camera.width * problem.photo.panorama.rgb.shape[1])
-    estimate = add_errors(estimate, (problem.method.edge_error * per_px) ** 2 * np.eye(len(LENS)))
-    is_focal = np.arange(len(LENS)) == FOCAL
-    estimate = add_errors(estimate, scatter * np.diag(is_focal))
+    errors = (problem.method.edge_error * per_px) ** 2 * np.eye(len(LENS))
+    errors[FOCAL, FOCAL] += scatter
+    estimate = add_errors(estimate, errors)
     if by_matches is not None:
         estimate = add_matches(estimate, by_matches)
     acting_range = compute_acting_range(problem.view_at(pose, "points"))
