@@ -20,6 +20,13 @@ class Client:
     def __init__(self, port, process):
         self.port = port
         self.process = process
+        self.is_told_to_end = False
+
+    def end(self):
+        """Send SIGTERM, once: a second one kills the interpreter while it shuts down."""
+        if not self.is_told_to_end and self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+        self.is_told_to_end = True
 
     def ask(self, method, path, body=b"", **headers):
         """Status, headers and body of an answer."""
@@ -70,6 +77,5 @@ def serving(*words, before=()):
     try:
         yield client
     finally:
-        if process.poll() is None:
-            process.send_signal(signal.SIGTERM)
+        client.end()
         client.rest = process.communicate(timeout=60)[1]

@@ -350,7 +350,7 @@ def test_a_full_queue_asks_to_come_again(scene, folder, photo):
             last = pool.submit(client.post, "/localize", "last.jpg", photo)
             while json.loads(client.ask("GET", "/health")[2])["waiting"] == 0:
                 time.sleep(0.01)
-            client.process.send_signal(signal.SIGTERM)
+            client.end()
             assert last.result()[0] == 200
     assert client.process.returncode == 143
 
