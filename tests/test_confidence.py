@@ -65,6 +65,20 @@ def test_each_kind_of_evidence_has_a_model_of_its_own():
     assert classify(p, 0.9) == rule.NOT_LOCALIZED
 
 
+@pytest.mark.parametrize(
+    ("mirrored", "factor"),
+    [
+        (ELSEWHERE._replace(score=0.001), 1.0),  # a mirrored photo that fits far worse tells nothing
+        (RIGHT, 1.0 + 0.5 / rule.SYMMETRIC),  # one that fits as well does so by chance, or by symmetry
+        (RIGHT._replace(num_matches=60_000), 1.0 + 1.0 / rule.SYMMETRIC),  # all the more, but with a bound
+    ],
+)
+def test_a_photo_that_fits_as_well_mirrored_may_fit_by_chance(mirrored, factor):
+    alone, none = posterior([RIGHT], SURE)
+    p = posterior([RIGHT], SURE, mirrored=mirrored)
+    assert p[-1] / p[0] == pytest.approx(factor * none / alone, rel=1e-3)
+
+
 @pytest.mark.parametrize("copies", [2, 3, 5])
 def test_copies_share_the_probability_alike_and_none_of_them_is_localized(copies):
     p = posterior([RIGHT] * copies, SURE)

@@ -57,3 +57,4 @@ class Case(NamedTuple):
     measured: Measured
     geometry: Geometry | None = None  # None if it was not compared with the scan
     is_mirrored: bool = False  # the photo fits the scan better mirrored
+    mirrored: Standing | None = None  # evidence for the mirrored photo; None if it explains far less

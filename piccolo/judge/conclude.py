@@ -56,6 +56,7 @@ def conclude(frame: MapFrame, case: Case, belief: Belief, min_confidence: float)
         gaussian=gaussian,
         std_of_fit=std_of_fit,
         standings=case.standings,
+        mirrored=case.mirrored,
     )
     decided = described.take_belief(belief.rule_out(*reasons), min_confidence)
     doubts = () if geometry is None else explain_doubts(geometry, decided.status)

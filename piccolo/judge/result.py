@@ -129,6 +129,8 @@ class Result:
     std_of_fit: float | None = field(default=None, compare=False, repr=False)
     # evidence for the pose and each alternative
     standings: tuple[Standing, ...] = field(default=(), compare=False, repr=False)
+    # evidence for the best pose of the mirrored photo
+    mirrored: Standing | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         """Make the arrays read-only, as the JSON and the hash depend on them."""
@@ -218,6 +220,7 @@ class Result:
             gaussian=None,
             std_of_fit=None,
             standings=(),
+            mirrored=None,
         )
 
     def summary(self) -> str:

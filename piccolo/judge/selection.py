@@ -118,14 +118,20 @@ def is_faint(profile: Profile, found: Selection) -> bool:
     return max(count_matches(profile, found.candidates)) <= profile.method.chance_matches
 
 
+def assess_mirrored(profile: Profile, best: Candidate, mirrored: Candidate) -> Standing:
+    """Return the evidence for the best pose of the mirrored photo, compared with the photo as it is."""
+    (alone,) = assess_alone(profile, [mirrored])
+    return alone._replace(ratio=mirrored.score / best.score)
+
+
 def explains_more(method: Method, mirrored: Candidate, own: Candidate) -> bool:
     """Return True if the mirrored photo is explained better; in a symmetric scene both are about equal."""
     return mirrored.score > method.mirror_ratio * own.score
 
 
-def is_mirrored(method: Method, own: Candidate, mirrored: Candidate | None) -> bool:
+def is_mirrored(method: Method, own: Candidate, mirrored: Candidate) -> bool:
     """Return True if a photo fits better mirrored: a pose explains more, and more features agree with it."""
-    if mirrored is None or not explains_more(method, mirrored, own):
+    if not explains_more(method, mirrored, own):
         return False
     return (mirrored.num_matches or 0) > (own.num_matches or 0)
 

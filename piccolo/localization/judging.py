@@ -18,7 +18,7 @@ from ..judge.case import Case
 from ..judge.conclude import conclude
 from ..judge.probability import posterior
 from ..judge.result import Result, nothing_found
-from ..judge.selection import assess, credit_copies, is_mirrored
+from ..judge.selection import assess, assess_mirrored, credit_copies, is_mirrored
 from ..problem.accuracy import Demand
 from ..problem.problem import Problem
 from ..system.jobs.threads import Workers
@@ -58,7 +58,8 @@ def judge(found: Found, means: Means, demand: Demand, may_promote: bool = True) 
         return nothing_found()
     reported, is_copy = list_reported(problem, selection, means.effort, workers)
     standings = credit_copies(assess(problem.profile, reported), is_copy)
-    places = posterior(standings, measured.errors.std_of_fit, problem.method)[:-1]
+    std_of_fit = measured.errors.std_of_fit
+    places = posterior(standings, std_of_fit, problem.method)[:-1]
     likeliest = int(places.argmax())
     if likeliest and is_copy[likeliest] and may_promote:
         other = promote(problem, selection, reported.candidates[likeliest], fit, workers)
@@ -69,7 +70,9 @@ def judge(found: Found, means: Means, demand: Demand, may_promote: bool = True) 
         if fit.of_difference is not None:
             measured = measured._replace(errors=measured.errors.widen(fit.of_difference))
     case = Case(reported, tuple(standings), measured, fit and describe_geometry(problem, fit))
-    return decide_case(problem, case, belief, means, demand.min_confidence)
+    case = try_mirrored(problem, case, belief, means)
+    places = posterior(standings, std_of_fit, problem.method, mirrored=case.mirrored)[:-1]
+    return decide_case(problem, case, make_belief(places, belief.within), means, demand.min_confidence)
 
 
 def promote(
@@ -110,17 +113,33 @@ def judge_together(
     )
     standings = tuple(assess(problem.profile, selection))
     case = Case(selection, standings, measured, fit and describe_geometry(problem, fit))
+    case = try_mirrored(problem, case, belief, means)
     return decide_case(problem, case, belief, means, min_confidence)
 
 
-def decide_case(problem: Problem, case: Case, belief: Belief, means: Means, min_confidence: float) -> Result:
-    """Return the result of a case; the mirrored photo is searched if any pose is likely."""
-    if case.geometry is not None:  # no pose is surer than the geometry that it rests on
-        belief = replace(belief, doubt=case.geometry.doubt)
+def try_mirrored(problem: Problem, case: Case, belief: Belief, means: Means) -> Case:
+    """Return a case with the evidence for the mirrored photo, which is searched if any pose is likely."""
     best = case.found.best
-    if belief.sound_places[-1] < 1.0 - problem.method.worth_asking:
-        mirrored = find_mirrored(problem, best, means.effort, means.workers)
-        case = case._replace(is_mirrored=is_mirrored(problem.method, best, mirrored))
+    belief = doubt_geometry(case, belief)
+    if belief.sound_places[-1] >= 1.0 - problem.method.worth_asking:
+        return case
+    mirrored = find_mirrored(problem, best, means.effort, means.workers)
+    if mirrored is None:
+        return case
+    return case._replace(
+        is_mirrored=is_mirrored(problem.method, best, mirrored),
+        mirrored=assess_mirrored(problem.profile, best, mirrored),
+    )
+
+
+def doubt_geometry(case: Case, belief: Belief) -> Belief:
+    """Return a belief with the doubt about the photo's geometry: no pose is surer than what it rests on."""
+    return belief if case.geometry is None else replace(belief, doubt=case.geometry.doubt)
+
+
+def decide_case(problem: Problem, case: Case, belief: Belief, means: Means, min_confidence: float) -> Result:
+    """Return the result of a case."""
+    belief = doubt_geometry(case, belief)
     found = conclude(problem.scan_map, case, belief, min_confidence)
     means.trace.note("judged", partial(describe_case, problem, case, found.belief))
     return found

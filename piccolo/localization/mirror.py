@@ -1,4 +1,8 @@
-"""A mirrored photo, left for right: if it fits the scan better, the photo was turned over."""
+"""A mirrored photo, left for right: if it fits the scan better, the photo was turned over.
+
+The scan shows a mirror image nowhere, so that it fits by chance alone. If it fits nearly as well as the photo
+itself, that one may fit by chance too: it is a decoy (Elias and Gygi, 2007).
+"""
 
 from dataclasses import replace
 
@@ -8,7 +12,6 @@ from ..evidence.examine import count_agreeing
 from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose, multiply, uniform_yaws
 from ..judge.candidate import Candidate
-from ..judge.selection import explains_more
 from ..problem.method import Method
 from ..problem.photo_images import MIRROR
 from ..problem.problem import Problem
@@ -23,7 +26,7 @@ UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 
 
 def find_mirrored(problem: Problem, best: Candidate, effort: Effort, workers: Workers) -> Candidate | None:
-    """Return the best pose of the mirrored photo; None if it explains no more than the photo's own best.
+    """Return the best pose of the mirrored photo; None if it explains far less than the photo's own best.
 
     The mirrored photo is not searched if the photo is explained well and has many matches, if the scan has no
     colours, and if the pose is by whole views alone, as the first look has then compared both.
@@ -32,7 +35,7 @@ def find_mirrored(problem: Problem, best: Candidate, effort: Effort, workers: Wo
         return None
     mirrored = problem.mirror()
     found = search_mirrored(problem, mirrored, best.pose, effort, workers)
-    if not found or not explains_more(problem.method, found[0], best):
+    if not found or found[0].score < problem.method.rival_ratio * best.score:
         return None
     return count_agreeing(mirrored, found[0], workers)
 
@@ -61,7 +64,7 @@ def search_mirrored(
         starts = search_poses(turned, "known", effort, workers)
         return refine_starts(turned, starts, problem.profile.beam, workers)
     ends = descend_briefly(turned, effort.brief(), workers)
-    if ends.best_score <= own_ends.best_score:
+    if ends.best_score < problem.method.rival_ratio * own_ends.best_score:
         return []
     return refine_starts(turned, ends.poses, FIRST_BEAM, workers)
 

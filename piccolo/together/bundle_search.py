@@ -176,7 +176,9 @@ def find_supports(
     standings = assess(problem.profile, selection)
     likeliest = max(at, key=lambda k: log_odds(standings[k], problem.method))
     is_copy = list_copies(problem, ranked, likeliest, workers)
-    p = posterior(credit_copies(standings, is_copy), errors[likeliest].std_of_fit, problem.method)
+    std_of_fit = errors[likeliest].std_of_fit
+    credited = credit_copies(standings, is_copy)
+    p = posterior(credited, std_of_fit, problem.method, mirrored=member.alone.mirrored)
     odds = p[:-1] / max(float(p[-1]), LEAST_NONE)
     is_there = [any(ONE_IN_BUNDLE.holds(h.pose, place) for place in places) for h in ranked]
     odds_there = float(odds[is_there].sum()) / max(len(places), 1)
