@@ -1,7 +1,7 @@
 """Photos that several tests localize are searched by themselves once for all tests of a module."""
 
 from piccolo.api import scan_photo
-from piccolo.together import members, mirrored
+from piccolo.together import members
 
 
 def _content(panorama):
@@ -31,7 +31,7 @@ def _share(patch, owner, name, key):
 
 
 def search_alone_once(patch):
-    """Share what photos find by themselves, and if they are mirrored, for each number of threads.
+    """Share what photos find by themselves, for each number of threads.
 
     A search whose steps are noted is not shared.
     """
@@ -40,14 +40,7 @@ def search_alone_once(patch):
         traced = object() if shot.trace.is_wanted else None
         return _points(scan_map), _content(shot.panorama), shot.settings, workers.num_threads, traced
 
-    def mirror(member, result, means):
-        problem = member.found.problem
-        pose = result.best_pose and result.best_pose.key
-        known = _content(problem.photo.panorama), pose, result.confidence
-        return _points(problem.scan_map), *known, means.workers.num_threads
-
     _share(patch, members, "find_alone", alone)
-    _share(patch, mirrored, "compare_mirrored", mirror)
 
 
 def search_photos_once(patch):

@@ -12,14 +12,16 @@ from groups import SEED, taken_photos
 from made_up import make_candidate
 from once import search_alone_once
 
+from piccolo.evidence.examine import count_agreeing, examine
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add, subtract
 from piccolo.judge.belief import make_belief
-from piccolo.judge.candidate import NO_CANDIDATE
+from piccolo.judge.candidate import NO_CANDIDATE, Selection
 from piccolo.judge.reasons import MIRRORED, Reason
 from piccolo.judge.result import Result, nothing_found
-from piccolo.judge.selection import select_mirrored
+from piccolo.judge.selection import assess, assess_mirrored, select_mirrored
 from piccolo.local_features.keypoints import Keypoints
+from piccolo.localization.mirror import find_mirrored
 from piccolo.photo.panorama import Panorama
 from piccolo.system.jobs.threads import Stopwatch, Workers
 from piccolo.together import group, members, mirrored
@@ -239,7 +241,7 @@ def test_linked_photos_are_refused_if_they_fit_better_mirrored(monkeypatch, alon
     results = dict.fromkeys(members, _belief("localized")) | {2: _belief("not_localized")}
     members[2] = SimpleNamespace(alone=results[2])
     others = {0: (1,), 1: (0,), 2: ()}
-    refused = mirrored.refuse_mirrored(results, others, members, None, 0.9)
+    refused = mirrored.refuse_mirrored(results, others, members, 0.9)
     assert list(refused) == ([0, 1] if is_refused else [])
     for result in refused.values():
         assert result.status == "not_localized"
@@ -256,7 +258,7 @@ def test_a_photo_that_mirrored_ones_put_at_their_place_is_refused_with_them(monk
     members = {k: SimpleNamespace(alone=_belief(status)) for k, status in enumerate(statuses)}
     results = dict.fromkeys(members, _belief("localized"))
     others = {0: (), 1: (2,), 2: (1,)} if is_together else {0: (), 1: (), 2: ()}
-    refused = mirrored.refuse_mirrored(results, others, members, None, 0.9)
+    refused = mirrored.refuse_mirrored(results, others, members, 0.9)
     assert list(refused) == ([1, 2] if is_together else [1])
 
 
@@ -267,15 +269,15 @@ def test_a_mirrored_photo_has_less_odds_than_its_mirror_image(is_mirrored):
         photo = replace(photo, rgb=photo.rgb[:, ::-1], is_valid=photo.is_valid[:, ::-1])
     alone = rooms.locate(photo, rooms.scan_map(SEED), rooms.KNOWN)
     problem = rooms.ask(photo, rooms.scan_map(SEED), rooms.KNOWN)
+    best = count_agreeing(
+        problem, examine(problem, problem.scan_map.from_world(alone.best_pose)), rooms.WORKERS
+    )
+    seen = find_mirrored(problem, best, rooms.KNOWN.effort, rooms.WORKERS)
+    of_mirror = seen and assess_mirrored(problem.profile, best, seen)
+    result = replace(alone, standings=tuple(assess(problem.profile, Selection(best, ()))), mirrored=of_mirror)
     member = SimpleNamespace(found=SimpleNamespace(problem=problem))
-    odds = mirrored.compare_mirrored(member, alone, rooms.means(rooms.KNOWN))
+    odds = mirrored.compare_mirrored(member, result)
     assert bool(select_mirrored({0: odds}, False)) == is_mirrored
-
-
-def test_a_mirror_image_that_is_not_found_tells_nothing(monkeypatch):
-    monkeypatch.setattr(mirrored, "make_attempts", lambda *_: (None, []))
-    member = SimpleNamespace(found=SimpleNamespace(problem=_problems()[0]))
-    assert mirrored.compare_mirrored(member, _belief("localized"), rooms.means(rooms.KNOWN)) == 0.0
 
 
 def _together(photos, num_threads=2):

@@ -166,7 +166,7 @@ def localize_linked(members: Mapping[int, Member], means: Means, demand: Demand)
         linked = {k: grouped.get(k, Grouped(members[k].alone, ())) for k in numbers}
         results = {k: one.result for k, one in linked.items()}
         others = {k: one.others for k, one in linked.items()}
-        refused = refuse_mirrored(results, others, members, means, demand.min_confidence)
+        refused = refuse_mirrored(results, others, members, demand.min_confidence)
         grouped |= {k: Grouped(result, ()) for k, result in refused.items()}
     return grouped
 

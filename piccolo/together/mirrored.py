@@ -7,15 +7,11 @@ where they were taken.
 
 from collections.abc import Collection, Mapping
 
-from ..evidence.examine import choose
 from ..judge.conclude import rule_out_mirrored
 from ..judge.probability import LOCALIZED, log_odds
 from ..judge.reasons import Reason
 from ..judge.result import Result
-from ..judge.selection import assess, rank, select_mirrored
-from ..localization.attempts import plan_attempts
-from ..localization.means import Means
-from ..localization.run import make_attempts
+from ..judge.selection import select_mirrored
 from .members import Member
 
 
@@ -23,13 +19,12 @@ def refuse_mirrored(
     results: Mapping[int, Result],
     others: Mapping[int, Collection[int]],
     members: Mapping[int, Member],
-    means: Means,
     min_confidence: float,
 ) -> dict[int, Result]:
     """Return refused results of those localized photos among linked ones that were mirrored.
 
     `others` are the photos with which each was localized together. Mostly all of these were mirrored or none
-    was. So the mirror images are searched if one of the linked photos was ruled out as mirrored by itself, or
+    was. So the mirror images are compared if one of the linked photos was ruled out as mirrored by itself, or
     if no localized photo was sure by itself.
     """
     localized = [k for k, result in results.items() if result.status == LOCALIZED]
@@ -37,7 +32,7 @@ def refuse_mirrored(
     one_is_sure = any(members[k].alone.status == LOCALIZED for k in localized)
     if not localized or (one_is_sure and not one_is_mirrored):
         return {}
-    differences = {k: compare_mirrored(members[k], results[k], means) for k in localized}
+    differences = {k: compare_mirrored(members[k], results[k]) for k in localized}
 
     def was_mirrored(number: int) -> bool:
         together = {k: differences[k] for k in (number, *others[number]) if k in differences}
@@ -46,16 +41,12 @@ def refuse_mirrored(
     return {k: rule_out_mirrored(results[k], min_confidence) for k in filter(was_mirrored, localized)}
 
 
-def compare_mirrored(member: Member, result: Result, means: Means) -> float:
+def compare_mirrored(member: Member, result: Result) -> float:
     """Return the log odds of the best pose of the mirrored photo, less those of the poses of its result.
 
-    They are 0 if the mirrored photo is not found: that tells nothing.
+    If the mirrored photo explains far less, it is the bound below which it does.
     """
-    problem = member.found.problem.mirror()
-    searched, candidates = make_attempts(plan_attempts(problem), means)
-    ranked = rank(candidates)
-    if ranked.best.score < problem.method.faint_score:
-        return 0.0
-    mirrored = assess(searched.profile, choose(searched, ranked, means.workers))
-    own = max(log_odds(standing, problem.method) for standing in result.standings)
-    return log_odds(mirrored[0], problem.method) - own
+    method = member.found.problem.method
+    own = max(result.standings, key=lambda standing: log_odds(standing, method))
+    less = own._replace(ratio=method.rival_ratio * own.ratio, score=method.rival_ratio * own.score)
+    return log_odds(result.mirrored or less, method) - log_odds(own, method)
