@@ -22,10 +22,12 @@ from made_up import (
 from piccolo.evidence.examine import examine
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import Pose, exp_so3, step
-from piccolo.judge.probability import LOCALIZED
+from piccolo.judge.probability import LOCALIZED, NOT_LOCALIZED
+from piccolo.judge.reasons import MIRRORED, Reason
 from piccolo.judge.selection import is_clear
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import attempts, beam, run as method
+from piccolo.localization.attempts import FIRST_BEAM
 from piccolo.localization.means import NO_TRACE
 from piccolo.localization.search import search_poses
 from piccolo.photo.panorama import GPano, Panorama
@@ -69,13 +71,11 @@ def test_a_clear_photo_needs_no_features_and_the_result_says_so():
     )
 
 
-@pytest.mark.parametrize("how", ["mirrored", "gravity unknown", "part of a sphere"])
+@pytest.mark.parametrize("how", ["gravity unknown", "part of a sphere"])
 def test_features_are_asked_of_what_is_not_clear(how):
     panorama = rooms.as_panorama(rooms.query(1).rgb)
     settings = rooms.KNOWN
-    if how == "mirrored":
-        panorama = _turned_over(panorama)
-    elif how == "gravity unknown":
+    if how == "gravity unknown":
         settings = rooms.UNKNOWN
     else:
         is_valid = panorama.is_valid.copy()
@@ -83,7 +83,28 @@ def test_features_are_asked_of_what_is_not_clear(how):
         panorama = replace(panorama, is_valid=is_valid)
     found = _localized(panorama, settings)
     assert isinstance(found.evidence.num_matches, int)
-    assert (found.status == LOCALIZED) == (how != "mirrored")
+    assert found.status == LOCALIZED
+
+
+def test_a_photo_that_was_turned_over_is_searched_no_further():
+    turned = _turned_over(rooms.as_panorama(rooms.query(1).rgb))
+    found = _localized(turned, scan_map=replace(rooms.scan_map(1), places=None))
+    assert (found.status, found.warnings, found.best_pose) == (NOT_LOCALIZED, (MIRRORED,), None)
+    assert found.belief.ruled_out == {Reason.MIRRORED}
+
+
+@pytest.mark.parametrize("is_turned", [False, True])
+def test_a_mirrored_photo_must_explain_half_more_to_end_the_search(is_turned):
+    panorama = rooms.as_panorama(rooms.query(1).rgb)
+    problem = _problem(_turned_over(panorama) if is_turned else panorama).by_views().mirror()
+    means = rooms.means(rooms.KNOWN)
+    brief = means._replace(effort=means.effort.brief())
+    best = max(one.score for one in attempts.search_and_refine(problem, "known", FIRST_BEAM, brief))
+    for factor in (0.999, 1.001):
+        known = [make_candidate(0.0, factor * best / METHOD.turned_over_ratio)]
+        found, is_done = attempts.look_mirrored(problem, known, means)
+        assert found is known
+        assert is_done == (is_turned and factor < 1.0)
 
 
 @pytest.mark.parametrize(("score", "margin"), [(0.3, 0.51), (0.29, 0.51), (0.3, 0.49)])
@@ -185,10 +206,12 @@ def _list_attempts(problem):
         if isinstance(run, partial)
         else (by.profile.uses_matches, run)
         for by, run in planned
+        if by.is_mirrored == (run is attempts.look_mirrored)
     ]
 
 
 LOOK = (False, attempts.look_first)
+TURNED = (False, attempts.look_mirrored)
 DRAWN = (True, attempts.draw_found)
 PLACES = (True, attempts.search_features)
 FIRST_UPRIGHT = (True, attempts.search_views, {"tilts": "known"})
@@ -201,10 +224,10 @@ ABOUT_LEVEL = [(True, run, {"tilts": "level"}) for run in (attempts.search_brief
 @pytest.mark.parametrize(
     ("profile", "has_tilt", "gravity", "expected"),
     [
-        (WHOLE, False, "auto", [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, PLACES]),
-        (WHOLE, False, "known", [LOOK, DRAWN, FIRST_UPRIGHT, PLACES]),
+        (WHOLE, False, "auto", [LOOK, TURNED, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, PLACES]),
+        (WHOLE, False, "known", [LOOK, TURNED, DRAWN, FIRST_UPRIGHT, PLACES]),
         (WHOLE, False, "unknown", [PLACES, TILTED]),
-        (WHOLE, True, "auto", [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, PLACES]),
+        (WHOLE, True, "auto", [LOOK, TURNED, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, PLACES]),
         (PARTIAL, False, "auto", [*ABOUT_LEVEL, TILTED, PLACES]),
         (PARTIAL, False, "known", [*ABOUT_LEVEL, PLACES]),
         (PARTIAL, False, "unknown", [PLACES, *ABOUT_LEVEL, TILTED]),
@@ -217,7 +240,7 @@ def test_attempts_are_made_in_this_order(profile, has_tilt, gravity, expected):
 
     The scan is drawn at its places last unless the tilt may be any: that takes long the first time.
     """
-    photo = SimpleNamespace(has_tilt=has_tilt)
+    photo = SimpleNamespace(has_tilt=has_tilt, mirror=lambda: None)
     assert _list_attempts(replace(PROBLEM, profile=profile, photo=photo, gravity=gravity)) == expected
 
 

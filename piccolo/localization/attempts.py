@@ -60,20 +60,21 @@ def plan_attempts(problem: Problem) -> list[tuple[Problem, Attempt]]:
     looks_first = profile.uses_matches and can_look_first(problem)
     first: list[tuple[Problem, Attempt]] = []
     if looks_first:
-        first = [(problem.by_views(), look_first), (problem, draw_found)]
+        by_views = problem.by_views()
+        first = [(by_views, look_first), (by_views.mirror(), look_mirrored), (problem, draw_found)]
     if problem.rotations is not None:
         first.append((problem, look_along_walls))
-    by_views: list[tuple[Problem, Attempt]] = []
+    views: list[tuple[Problem, Attempt]] = []
     if profile.is_always_upright or problem.gravity != "unknown":
         upright: Tilts = "known" if problem.photo.has_tilt else profile.default_tilt
         if profile.is_narrow:
-            by_views.append((problem, partial(search_briefly, tilts=upright)))
-        by_views.append((problem, partial(search_views, tilts=upright)))
+            views.append((problem, partial(search_briefly, tilts=upright)))
+        views.append((problem, partial(search_views, tilts=upright)))
     if problem.gravity != "known":
-        by_views.append((problem, partial(search_views, tilts="any", is_brief=looks_first)))
-    by_features: list[tuple[Problem, Attempt]] = [(problem, search_features)] if profile.uses_matches else []
+        views.append((problem, partial(search_views, tilts="any", is_brief=looks_first)))
+    features: list[tuple[Problem, Attempt]] = [(problem, search_features)] if profile.uses_matches else []
     features_last = looks_first or (profile.is_narrow and problem.gravity != "unknown")
-    return [*first, *by_views, *by_features] if features_last else [*first, *by_features, *by_views]
+    return [*first, *views, *features] if features_last else [*first, *features, *views]
 
 
 def look_first(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
@@ -94,6 +95,20 @@ def look_first(problem: Problem, known: list[Candidate], means: Means) -> tuple[
 def beats_mirror(method: Method, own: float, mirrored: float) -> bool:
     """Return True if by brief scores a photo fits better as it is than mirrored."""
     return own >= method.first_mirror_ratio * mirrored
+
+
+def look_mirrored(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
+    """Search a mirrored photo briefly by whole views; True if it was turned over.
+
+    Then one pose alone explains the mirrored photo, and far more than any pose of the photo as it is.
+    """
+    brief = means._replace(effort=means.effort.brief())
+    mirrored = search_and_refine(problem, "known", FIRST_BEAM, brief)
+    with means.watch.stage("refine"):
+        chosen = choose(problem, rank(mirrored), means.workers)
+        own = rank(known).best.score
+        explains_far_more = chosen.best.score >= problem.method.turned_over_ratio * own
+        return known, explains_far_more and is_clear(problem.profile, chosen)
 
 
 def draw_found(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:

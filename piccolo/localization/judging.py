@@ -12,11 +12,12 @@ from ..evidence.examine import complete
 from ..evidence.focal_length import FocalFit, doubt_unconfirmed, fit_focal
 from ..evidence.measuring import Fit, describe_geometry, measure
 from ..geometry.pose_gaussian import PoseGaussian
-from ..judge.belief import Belief, make_belief
+from ..judge.belief import NOTHING, Belief, make_belief
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Case
 from ..judge.conclude import conclude
 from ..judge.probability import posterior
+from ..judge.reasons import MIRRORED, Reason
 from ..judge.result import Result, nothing_found
 from ..judge.selection import assess, assess_mirrored, credit_copies, is_mirrored
 from ..problem.accuracy import Demand
@@ -53,6 +54,8 @@ def judge(found: Found, means: Means, demand: Demand, may_promote: bool = True) 
     """
     problem, selection, fit = found
     workers = means.workers
+    if problem.is_mirrored:
+        return nothing_found(MIRRORED, belief=NOTHING.rule_out(Reason.MIRRORED))
     measured = measure(problem, selection, fit, workers)
     if measured is None:
         return nothing_found()

@@ -10,7 +10,7 @@ from ..geometry.pose import Pose
 from ..judge.alternatives import MAX_ALTERNATIVES
 from ..judge.belief import NOTHING, make_belief
 from ..judge.by_others import share_place
-from ..judge.candidate import Candidate, Selection
+from ..judge.candidate import NO_CHOICE, Candidate, Selection
 from ..judge.probability import LOCALIZED
 from ..judge.reasons import Reason
 from ..judge.result import Result, nothing_found
@@ -74,13 +74,16 @@ def explain_nothing(scan_map: ScanMap, panorama: Panorama, prior: Prior) -> Resu
 def find(problem: Problem, scan_map: ScanMap, means: Means) -> Found:
     """Search until one attempt is sure, and refine the best poses to the end.
 
-    `scan_map` is the whole map; the problem has the part of it that the prior allows.
+    `scan_map` is the whole map; the problem has the part of it that the prior allows. If the photo was turned
+    over, the result has its mirrored images, and no pose.
     """
     images = problem.photo.images
     workers = means.workers
     # idle cores prepare the images that later steps need
     with workers.beside(images.middle, images.fine, images.full, problem.colors):
         searched, candidates = make_attempts(plan_attempts(problem), means)
+        if searched.is_mirrored:
+            return Found(searched, NO_CHOICE, None)
         candidates += search_beyond_prior(searched, scan_map, means)
         with means.watch.stage("refine"):
             refined = refine_best(searched, candidates, workers)

@@ -46,6 +46,7 @@ class Problem:
     gravity: Gravity
     rotations: Array | None = None  # (N, 3, 3) camera from map: only these are searched; None: all
     beside: tuple[Matches, ...] = ()  # one for each photo of known pose that shows the same
+    is_mirrored: bool = False  # the images are those of the photo mirrored left for right
 
     @property
     def method(self) -> Method:
@@ -85,6 +86,7 @@ class Problem:
             prior=self.prior.without_heading(),
             rotations=rotations,
             beside=(),
+            is_mirrored=not self.is_mirrored,
         )
 
     def view_at(self, pose: Pose, name: ViewName) -> Cells:
