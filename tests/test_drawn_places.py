@@ -109,7 +109,9 @@ def test_the_scan_is_drawn_where_a_photo_may_be_and_first_where_it_is_likely(mon
     assert places.choose(positions[:1] + 0.1, nowhere)[0] == 0
     assert len(places.choose(positions[:1] + 100.0, nowhere)) == 0
     assert len(places.choose(nowhere, nowhere)) == 0
-    monkeypatch.setattr(drawn_places, "MOST_DRAWN", 2)
+    monkeypatch.setattr(drawn_places, "MOST_DRAWN", 3)
+    monkeypatch.setattr(drawn_places, "MOST_LIKELY", 2)
+    assert places.choose(positions, nowhere).tolist() == [0, 1, 2]
     for k in range(len(positions)):
         chosen = places.choose(positions, positions[k : k + 1]).tolist()
         assert chosen[0] == k

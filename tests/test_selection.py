@@ -11,9 +11,16 @@ from made_up import PARTIAL, PROBLEM, WHOLE, make_candidate, make_selection, pla
 from piccolo.evidence.examine import complete, count_agreeing, examine
 from piccolo.geometry.pose import step
 from piccolo.judge.candidate import Selection
-from piccolo.judge.probability import Standing
+from piccolo.judge.probability import MOST_RATIO, Standing
 from piccolo.judge.result import nothing_found
-from piccolo.judge.selection import assess, credit_copies, list_drawn, select, select_mirrored
+from piccolo.judge.selection import (
+    assess,
+    assess_mirrored,
+    credit_copies,
+    list_drawn,
+    select,
+    select_mirrored,
+)
 from piccolo.localization import last_descent
 from piccolo.localization.attempts import end_search
 from piccolo.localization.beam import refine_matches
@@ -249,6 +256,13 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere():
     assert (alone.evidence.margin, alone.evidence.alternative_matches) == (1.0, 0)
     nothing = pack_texels(panorama.rgb, np.zeros_like(panorama.is_valid))
     assert judged(best, asked=replace(problem, colors=lambda: nothing)) == nothing_found()  # no point is seen
+
+
+@pytest.mark.parametrize(("score", "ratio"), [(0.5, 0.8), (0.0, MOST_RATIO)])
+def test_a_mirrored_photo_is_compared_with_the_photo_by_what_poses_explain(score, ratio):
+    own, mirrored = make_candidate(0.0, score, 12), make_candidate(0.0, 0.4, 9)
+    standing = assess_mirrored(PARTIAL, own, mirrored)
+    assert standing == Standing(ratio, 0.4 * PARTIAL.discount, 9, PARTIAL.evidence)
 
 
 @pytest.mark.parametrize(("count", "expected"), [(12, 2), (11, 6)])

@@ -10,7 +10,7 @@ from ..problem.method import Method
 from ..problem.profile import Profile
 from .alternatives import alternative_poses, sort_by_score
 from .candidate import MAX_COMPARED, NO_CHOICE, Candidate, Selection
-from .probability import CONTRADICTED_ODDS, Standing, log_odds
+from .probability import CONTRADICTED_ODDS, MOST_RATIO, Standing, log_odds
 
 # Chosen: log odds of a mirrored photo against the photo as it is. Of 15 photos of a hospital none had more
 # than 0.41; one of the mirrored photos of racks had 2.3.
@@ -121,7 +121,8 @@ def is_faint(profile: Profile, found: Selection) -> bool:
 def assess_mirrored(profile: Profile, best: Candidate, mirrored: Candidate) -> Standing:
     """Return the evidence for the best pose of the mirrored photo, compared with the photo as it is."""
     (alone,) = assess_alone(profile, [mirrored])
-    return alone._replace(ratio=mirrored.score / best.score)
+    ratio = mirrored.score / best.score if best.score > 0.0 else MOST_RATIO
+    return alone._replace(ratio=ratio)
 
 
 def explains_more(method: Method, mirrored: Candidate, own: Candidate) -> bool:
