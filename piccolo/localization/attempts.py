@@ -26,7 +26,7 @@ from ..problem.settings import Effort
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
 from ..system.jobs.threads import Once, Workers
-from .beam import refine_matches, refine_starts, score_mirror, score_starts
+from .beam import refine_matches, refine_starts, score_mirror, score_near, score_starts
 from .means import Means
 from .search import search_poses
 
@@ -100,14 +100,19 @@ def beats_mirror(method: Method, own: float, mirrored: float) -> bool:
 def look_mirrored(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
     """Search a mirrored photo briefly by whole views; True if it was turned over.
 
-    Then one pose alone explains the mirrored photo, and far more than any pose of the photo as it is.
+    Then one pose alone explains the mirrored photo, and far more than any pose of the photo as it is. It is
+    refined only if a brief score is better too.
     """
-    brief = means._replace(effort=means.effort.brief())
-    mirrored = search_and_refine(problem, "known", FIRST_BEAM, brief)
-    with means.watch.stage("refine"):
-        chosen = choose(problem, rank(mirrored), means.workers)
-        own = rank(known).best.score
-        explains_far_more = chosen.best.score >= problem.method.turned_over_ratio * own
+    effort, workers, watch, _ = means
+    own = rank(known).best
+    with watch.stage("search"):
+        starts = search_poses(problem, "known", effort.brief(), workers)
+    with watch.stage("refine"):
+        brief = score_near(problem.mirror(), own.pose, workers)
+        if not beats_mirror(problem.method, score_starts(problem, starts, workers), brief):
+            return known, False
+        chosen = choose(problem, rank(refine_starts(problem, starts, FIRST_BEAM, workers)), workers)
+        explains_far_more = chosen.best.score >= problem.method.turned_over_ratio * own.score
         return known, explains_far_more and is_clear(problem.profile, chosen)
 
 
