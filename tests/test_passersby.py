@@ -16,7 +16,14 @@ from piccolo.system.jobs.threads import Workers
 from piccolo.together.coloring import alignment, passersby
 from piccolo.together.coloring.alignment import Sightings
 from piccolo.together.coloring.painting import make_brushes, paint_points
-from piccolo.together.coloring.passersby import cast_votes, remove_passersby, spread_votes, without
+from piccolo.together.coloring.passersby import (
+    Votes,
+    cast_votes,
+    find_blame,
+    remove_passersby,
+    spread_votes,
+    without,
+)
 
 SEED = 1
 NUM_POINTS = 60_000
@@ -43,6 +50,10 @@ def test_votes_spread_as_in_numpy():
     [
         ([100, 110], [1, 1], [0, 0], 0),
         ([100, 180], [0, 0], [0, 0], 1),
+        ([100, 140], [1, 1], [0, 0], 0),  # the most that two differ if they agree, and three
+        ([100, 141], [0, 0], [0, 0], 1),
+        ([100, 100, 140], [1, 1, 1], [0, 0, 0], 0),
+        ([100, 100, 141], [1, 1, 0], [0, 0, 1], 0),
         ([100, 110, 200], [1, 1, 0], [0, 0, 1], 0),
         ([100, 110, None, 200], [1, 1, 0, 0], [0, 0, 0, 1], 0),
         ([100, None, 200], [0, 0, 0], [0, 0, 0], 1),
@@ -63,6 +74,18 @@ def test_most_decide_and_of_two_nobody(grays, agreed, outvoted, num_pairs):
     assert votes.is_outvoted.tolist() == [*map(bool, outvoted), False, False]
     assert len(votes.pairs) == num_pairs
     assert all(np.isfinite(values[pair]).all() for pair in votes.pairs)
+
+
+@pytest.mark.parametrize(
+    ("num_agreed", "num_outvoted", "blame"), [(0, 1, 0.5), (1, 2, 0.5), (0, 3, 0.75), (9, 0, 0.0)]
+)
+def test_a_cell_begins_with_one_vote_for_it(num_agreed, num_outvoted, blame):
+    is_agreed = np.arange(num_agreed + num_outvoted) < num_agreed
+    votes = Votes(is_agreed, ~is_agreed, np.empty((0, 2), np.int64))
+    cell = 60 * passersby.VOTE_WIDTH + 100
+    gray = np.full((256, 512, 3), 90, np.uint8)
+    found = find_blame(votes, np.full(len(is_agreed), cell), [gray], Workers(1))
+    assert found.ravel()[cell] == pytest.approx(blame, abs=1e-6)
 
 
 def test_what_is_blamed_at_the_seam_goes_on_across_it():
@@ -123,3 +146,21 @@ def test_photos_that_agree_and_one_in_another_light_stay_whole():
     assert min(shares(photos)) > 0.98
     *others, dark = shares([*photos[:2], replace(photos[2], rgb=photos[2].rgb // 4)])
     assert (min(others) > 0.9, dark) == (True, 1.0)
+
+
+def test_a_part_that_most_contradict_is_removed_but_no_more_than_half_of_a_photo(monkeypatch):
+    photos, poses = _photos([(), (), ()])
+
+    def blame_some(votes, cells, pictures, workers):
+        """Just over half of the votes in two and in three fifths of what is seen; half of them in all."""
+        blame = np.zeros((3, passersby.VOTE_WIDTH // 2, passersby.VOTE_WIDTH), np.float32)
+        voted = np.bincount(cells, minlength=blame.size).reshape(3, -1) > 0
+        for k, (share, value) in enumerate(((0.4, 0.51), (0.6, 0.51), (1.0, 0.5))):
+            seen = np.flatnonzero(voted[k])
+            blame[k].ravel()[seen[: int(share * len(seen))]] = value
+        return blame
+
+    monkeypatch.setattr(passersby, "find_blame", blame_some)
+    left = remove_passersby(_octree(), photos, poses, np.ones((3, 3), np.float32), Workers(2))
+    is_whole = [panorama.is_valid.all() for panorama in left]
+    assert is_whole == [False, True, True]
