@@ -94,7 +94,7 @@ def test_a_photo_that_was_turned_over_is_searched_no_further():
 
 
 @pytest.mark.parametrize("is_turned", [False, True])
-def test_a_mirrored_photo_must_explain_half_more_to_end_the_search(is_turned):
+def test_a_mirrored_photo_must_explain_more_to_end_the_search(is_turned):
     panorama = rooms.as_panorama(rooms.query(1).rgb)
     problem = _problem(_turned_over(panorama) if is_turned else panorama).by_views().mirror()
     means = rooms.means(rooms.KNOWN)
@@ -105,6 +105,8 @@ def test_a_mirrored_photo_must_explain_half_more_to_end_the_search(is_turned):
         found, is_done = attempts.look_mirrored(problem, known, means)
         assert found is known
         assert is_done == (is_turned and factor < 1.0)
+    assert attempts.was_turned_over(METHOD, 0.43, 0.5)
+    assert not attempts.was_turned_over(METHOD, 0.1, 0.49)
 
 
 @pytest.mark.parametrize(("score", "margin"), [(0.3, 0.51), (0.29, 0.51), (0.3, 0.49)])

@@ -100,7 +100,7 @@ def beats_mirror(method: Method, own: float, mirrored: float) -> bool:
 def look_mirrored(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
     """Search a mirrored photo briefly by whole views; True if it was turned over.
 
-    Then one pose alone explains the mirrored photo, and far more than any pose of the photo as it is. It is
+    Then one pose alone explains the mirrored photo, and more than any pose of the photo as it is. It is
     refined only if a brief score is better too.
     """
     effort, workers, watch, _ = means
@@ -112,8 +112,13 @@ def look_mirrored(problem: Problem, known: list[Candidate], means: Means) -> tup
         if not beats_mirror(problem.method, score_starts(problem, starts, workers), brief):
             return known, False
         chosen = choose(problem, rank(refine_starts(problem, starts, FIRST_BEAM, workers)), workers)
-        explains_far_more = chosen.best.score >= problem.method.turned_over_ratio * own.score
-        return known, explains_far_more and is_clear(problem.profile, chosen)
+        explains_more = was_turned_over(problem.method, own.score, chosen.best.score)
+        return known, explains_more and is_clear(problem.profile, chosen)
+
+
+def was_turned_over(method: Method, own: float, mirrored: float) -> bool:
+    """Return True if by its scores a photo fits much better mirrored than as it is."""
+    return mirrored >= max(method.turned_over_score, method.turned_over_ratio * own)
 
 
 def draw_found(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
