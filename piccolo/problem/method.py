@@ -61,7 +61,7 @@ class Method:
     enough_explained: float = 0.7  # with this score and `enough_matches` a photo can't be mirrored
     mirror_ratio: float = 1.05  # least ratio of scores, mirrored photo to photo, of one that may be mirrored
     # the same, and the score of the mirrored photo, of one that is searched no further, as it was turned over:
-    # nine mirrored panoramas had at least 1.2 and 0.69, one of a symmetric hospital as it is 4.4 and 0.22
+    # nine mirrored panoramas had at least 1.2 and 0.69; one of a symmetric hospital as it is had 4.4, 0.22
     turned_over_ratio: float = 1.15
     turned_over_score: float = 0.5
     rival_ratio: float = 0.7  # the same, of one whose mirror image may fit as well by chance
