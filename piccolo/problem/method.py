@@ -60,7 +60,7 @@ class Method:
     worth_asking: float = 0.2  # the mirrored photo is tried if all poses together are at least so probable
     enough_explained: float = 0.7  # with this score and `enough_matches` a photo can't be mirrored
     mirror_ratio: float = 1.05  # least ratio of scores, mirrored photo to photo, of one that may be mirrored
-    # the same, and the score of the mirrored photo, of one that is searched no further, as it was turned over:
+    # the same, and the score of the mirrored photo, of one that was turned over, and is searched no further:
     # nine mirrored panoramas had at least 1.2 and 0.69; one of a symmetric hospital as it is had 4.4, 0.22
     turned_over_ratio: float = 1.15
     turned_over_score: float = 0.5
