@@ -35,7 +35,7 @@ def find_mirrored(problem: Problem, best: Candidate, effort: Effort, workers: Wo
         return None
     mirrored = problem.mirror()
     found = search_mirrored(problem, mirrored, best.pose, effort, workers)
-    if not found or found[0].score < problem.method.rival_ratio * best.score:
+    if not found or found[0].score < problem.method.decoy_ratio * best.score:
         return None
     return count_agreeing(mirrored, found[0], workers)
 
@@ -64,7 +64,7 @@ def search_mirrored(
         starts = search_poses(turned, "known", effort, workers)
         return refine_starts(turned, starts, problem.profile.beam, workers)
     ends = descend_briefly(turned, effort.brief(), workers)
-    if ends.best_score < problem.method.rival_ratio * own_ends.best_score:
+    if ends.best_score < problem.method.decoy_ratio * own_ends.best_score:
         return []
     return refine_starts(turned, ends.poses, FIRST_BEAM, workers)
 

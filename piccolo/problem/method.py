@@ -64,7 +64,7 @@ class Method:
     # nine mirrored panoramas had at least 1.2 and 0.69; one of a symmetric hospital as it is had 4.4, 0.22
     turned_over_ratio: float = 1.15
     turned_over_score: float = 0.5
-    rival_ratio: float = 0.7  # the same, of one whose mirror image may fit as well by chance
+    decoy_ratio: float = 0.7  # the same, of one whose mirror image may fit as well by chance
 
     def __post_init__(self) -> None:
         """Refuse values of a wrong type; the message names the field."""
