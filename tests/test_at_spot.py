@@ -16,7 +16,9 @@ from piccolo.judge.by_others import share_nearby
 from piccolo.judge.candidate import NO_CANDIDATE, NO_CHOICE, Selection
 from piccolo.judge.case import Errors
 from piccolo.judge.result import Result
+from piccolo.localization import turning
 from piccolo.localization.judging import Found
+from piccolo.localization.search import list_rotations
 from piccolo.problem.accuracy import Accuracy
 from piccolo.together import at_spot
 from piccolo.together.at_spot import (
@@ -26,6 +28,7 @@ from piccolo.together.at_spot import (
     hold_at_spots,
     hold_turned,
     search_at_spots,
+    search_rotations,
     turn_at,
 )
 from piccolo.together.group import take_average
@@ -156,6 +159,25 @@ def test_rotations_are_searched_at_a_spot_where_no_pose_was_found():
     chosen, one = hold_at_spots(found, here, rooms.means(rooms.KNOWN))
     rooms.assert_near(chosen.selection.best.pose, true_pose, 0.1, 2.0)
     assert one.gaussian.largest_std < 0.1
+
+
+def test_every_rotation_is_turned_at_a_spot(monkeypatch):
+    """Roughly all, then those that fit best."""
+    problem, true_pose = _photo()
+    started = []
+
+    def listen(problem, pose, images=turning.COARSE_TO_FINE):
+        started.append((images, pose))
+        return turning.turn(problem, pose, images)
+
+    monkeypatch.setattr(at_spot, "turn", listen)
+    found = search_rotations(problem, _spot(true_pose.center_world), rooms.means(rooms.KNOWN))
+    rough = [pose.R_cam_from_world for images, pose in started if images == ("middle",)]
+    np.testing.assert_array_equal(rough, list_rotations(problem, "level", rooms.KNOWN.effort))
+    assert len(started) == len(rough) + at_spot.ROUNDS_AT_SPOT * at_spot.NUM_SEARCHED
+    assert len(found) == at_spot.NUM_SEARCHED
+    assert np.diff([one.score for one in found]).max() <= 0.0
+    rooms.assert_near(found[0].pose, true_pose, 0.1, 2.0)
 
 
 def test_a_mirrored_photo_explains_more_at_the_spot_when_it_is_turned_over():

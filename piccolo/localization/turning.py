@@ -1,5 +1,7 @@
 """The rotation of a photo whose position is known by other means."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ..evidence.covariance import make_problem
@@ -7,9 +9,10 @@ from ..geometry.levenberg_marquardt import GRADIENT, MATRIX, levenberg_marquardt
 from ..geometry.pose import Pose, orthonormal
 from ..optimize.channel_loss import ChannelProblem, channel_equations
 from ..problem.problem import Problem
-from ..problem.stages import FULL
+from ..problem.stages import FULL, ImageName
 from ..system.arrays import Array
 
+COARSE_TO_FINE: tuple[ImageName, ...] = ("middle", "fine", "full")
 SUMS_OF_TURN = GRADIENT, GRADIENT + 1, GRADIENT + 2, *(MATRIX + k for k in (0, 1, 2, 6, 7, 11))
 SUMS_OF_MOVE = MATRIX + 15, MATRIX + 18, MATRIX + 20  # the diagonal alone: no gradient asks for a move
 
@@ -29,12 +32,12 @@ def turn_equations(
 descend_turns = levenberg_marquardt(turn_equations)
 
 
-def turn(problem: Problem, pose: Pose) -> Pose:
-    """Return the pose at the same position whose rotation fits the photo best, from coarse to fine."""
+def turn(problem: Problem, pose: Pose, images: Sequence[ImageName] = COARSE_TO_FINE) -> Pose:
+    """Return the pose at the same position whose rotation fits the photo best, on one image after another."""
     points = problem.view_at(pose, "points").around(pose.center_world)
     R_cam_from_map = pose.R_cam_from_world.copy()
     limits = FULL.limits
-    for image in ("middle", "fine", "full"):
+    for image in images:
         asked = make_problem(points, problem.photo.image(image))
         descend_turns(asked, limits.num_iterations, limits.tolerance, R_cam_from_map, np.zeros(3))
     return Pose(orthonormal(R_cam_from_map), pose.center_world)

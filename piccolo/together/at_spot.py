@@ -8,6 +8,7 @@ where it fits best.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from ..evidence.covariance import estimate_pose_errors
 from ..evidence.examine import choose, examine, examine_each
 from ..evidence.loose_covariance import estimate_loosely
-from ..geometry.nearness import ONE_ANSWER
+from ..geometry.nearness import DESCENDED, ONE_ANSWER
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LIKELY, PoseGaussian
 from ..judge.alternatives import sort_by_score, suppress_near
@@ -26,7 +27,7 @@ from ..judge.selection import assess, explains_more
 from ..localization.judging import Found
 from ..localization.ladder import refine
 from ..localization.means import Means
-from ..localization.search import search_poses
+from ..localization.search import list_rotations
 from ..localization.turning import turn
 from ..problem.accuracy import Accuracy
 from ..problem.problem import Problem
@@ -38,7 +39,9 @@ from .bundle import EVEN_ODDS, compare_errors
 from .optima import spread_optima
 from .spot import LEAST_AT_SPOT, Positioned, Spot, compute_density, fit_spot, gather
 
-NUM_SEARCHED = 12  # rotations of a photo at a spot that are turned to where it fits best
+NUM_SEARCHED = (
+    12  # rotations at a spot, the best of all, that are turned further to where the photo fits best
+)
 NUM_HELD = 4  # poses of a photo that are held at a spot
 LEAST_HELD = 0.7  # chosen: their score, divided by the best one's
 FITS_THERE = 0.9  # chosen: score of a pose that was turned at a spot, divided by that of where it fits best
@@ -227,14 +230,16 @@ def search_at_spots(found: Found, nearby: Nearby, means: Means) -> list[Held]:
 
 
 def search_rotations(problem: Problem, spot: Spot, means: Means) -> list[Candidate]:
-    """Search the rotations of a photo at a spot; return the best poses there, best first."""
+    """Search all rotations of a photo at a spot; return the best poses there, best first."""
+    workers = means.workers
     tilts = "known" if problem.photo.has_tilt else problem.profile.default_tilt
-    centers = problem.scan_map.centers[problem.scan_map.sparse]
-    apart = np.linalg.norm(centers - spot.axis, axis=1)
-    there = replace(problem, scan_map=problem.scan_map.narrow(apart <= apart.min()))
-    starts = search_poses(there, tilts, means.effort, means.workers).poses()[:NUM_SEARCHED]
-    turned = [turn_at(problem, start, spot) for start in starts]
-    return sort_by_score(examine_each(problem, turned, means.workers))
+    rotations = list_rotations(problem, tilts, means.effort)
+    starts = [Pose(R, spot.place(R).center) for R in rotations]
+    roughly = workers.map(partial(turn, problem, images=("middle",)), starts, "descend")
+    every = sort_by_score(examine_each(problem, roughly, workers))
+    best = suppress_near(every, NUM_SEARCHED, DESCENDED)
+    turned = workers.map(lambda one: turn_at(problem, one.pose, spot), best, "descend")
+    return sort_by_score(examine_each(problem, turned, workers))
 
 
 def fits_mirrored(found: Found, held: Held, nearby: Nearby, means: Means) -> bool:
