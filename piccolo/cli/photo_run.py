@@ -6,13 +6,11 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from ..api.scan import Scan
 from ..api.values import (
@@ -21,6 +19,7 @@ from ..api.values import (
     STATUSES,
     Change,
     CoarseToFineSettings,
+    Reason,
     Result,
     Step,
 )
@@ -28,11 +27,9 @@ from ..batch.answering import Answering, count_looks, follow_all
 from ..batch.inputs import describe_left_out, is_from_stdin, list_panoramas, read_priors
 from ..batch.localizer import Answer, Localizer
 from ..batch.results_file import FileOutput, Output, Records, StreamOutput
-from ..photo.panorama import read_panorama
 from ..photo.panorama.cube import is_cube
 from ..photo.panorama.facts import sha256_of
 from ..photo.panorama.masks import find_mask
-from ..photo.panorama.picture import encode_image
 from ..photo.photo import Photo
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
@@ -43,7 +40,6 @@ from ..system.files.atomic import (
     check_output,
     is_stdout,
     is_stream,
-    temporary_folder,
     write_atomically,
 )
 from ..system.files.line_file import open_locked, write_line
@@ -80,7 +76,7 @@ class Run:
     left_out: Counter[str]  # files in the folders named that are no panoramas, by suffix
     counts: Counter[str]  # results written, by status
     cloud_sha256: str | None = None  # of the scan, when it has been opened
-    doubtful: list[str] = field(default_factory=list)  # spheres that were not localized
+    are_mirrored: list[bool] = field(default_factory=list)  # of spheres that were not localized
     write_step: Write = ignore_step  # of a search
 
     @property
@@ -195,8 +191,8 @@ def record(run: Run, answer: Answer, write: Write) -> None:
     write_steps(run, result.pano, answer.steps)
     write(result.to_json())
     run.counts[result.status] += 1
-    if result.best_pose is not None and result.pose is None and not result.cameras:
-        run.doubtful.append(result.pano)
+    if result.pose is None and not result.cameras:
+        run.are_mirrored.append(Reason.MIRRORED in result.belief.ruled_out)
 
 
 def write_photo_pictures(
@@ -277,24 +273,12 @@ def look_again(run: Run, answering: Answering, output: Output) -> Interruption:
     return interruption
 
 
-def note_left_handed(run: Run, records: Records, answering: Answering, interruption: Interruption) -> None:
-    """Say so if no photo was localized, but most of the first spheres are when they are mirrored."""
+def note_left_handed(run: Run, records: Records, interruption: Interruption) -> None:
+    """Say so if no photo was localized, but most of the first spheres fit when they are mirrored."""
     is_over = interruption.number or run.counts[LOCALIZED] or records.counts[LOCALIZED]
-    if is_over or run.arguments.quiet or len(run.doubtful) < NUM_MIRRORED:
-        return
-    localizer = run.localizer
-    # the results are written: it is only a hint
-    with suppress(OSError, InputError), temporary_folder() as folder:
-        paths = [folder / f"{k}.png" for k in range(NUM_MIRRORED)]
-        for path, photo in zip(paths, run.doubtful, strict=False):
-            photo_asked, _ = localizer.ask(Path(photo))
-            panorama = read_panorama(photo_asked)
-            shown = np.dstack([panorama.rgb, np.uint8(255) * panorama.is_valid])
-            path.write_bytes(encode_image(shown[:, ::-1], ".png"))
-        answers = answering.answer_all(map(localizer.task, paths))
-        found = [answer.result.status for answer in answers]
-        if 2 * found.count(LOCALIZED) >= NUM_MIRRORED:
-            run.arguments.note(LEFT_HANDED)
+    first = run.are_mirrored[:NUM_MIRRORED]
+    if not is_over and len(first) == NUM_MIRRORED and 2 * sum(first) >= NUM_MIRRORED:
+        run.arguments.note(LEFT_HANDED)
 
 
 def finish(run: Run, records: Records, output: Output, interruption: Interruption, seconds: float) -> int:
@@ -394,5 +378,5 @@ def localize_photos(arguments: Arguments) -> int:
             interruption = localize_all(run, records, rest, answering, output.write)
             if run.looks_again and not interruption.number:
                 interruption = look_again(run, answering, output)
-            note_left_handed(run, records, answering, interruption)
+            note_left_handed(run, records, interruption)
         return finish(run, records, output, interruption, watch.seconds["all"])

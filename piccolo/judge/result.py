@@ -28,6 +28,7 @@ POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_f
 UNREADABLE = "unreadable"
 FAILED = "failed"
 STATUSES = (LOCALIZED, AMBIGUOUS, NOT_LOCALIZED, UNREADABLE, FAILED)
+NOTHING_COUNTS = "no place for a camera, or nothing of the photo counts"
 MAX_ROTATION_ERROR = 1e-6  # of R R^T from the identity, in a file
 COVARIANCE_CONVENTION = (
     "of (w, d), rotation [rad] about the camera's axes, then translation [m] along the world's: "
@@ -226,8 +227,10 @@ class Result:
     def summary(self) -> str:
         """Return the result as a few lines of text."""
         if self.best_pose is None:
-            why = self.error or "no place for a camera, or nothing of the photo counts"
-            return f"{printable(self.pano)}: {self.status}\n  {printable(why)}"
+            lines = [f"{printable(self.pano)}: {self.status}"]
+            if self.error or not self.warnings:
+                lines.append(f"  {printable(self.error or NOTHING_COUNTS)}")
+            return "\n".join(lines)
         x, y, z = self.best_pose.center_world
         total = sum(self.seconds.values())
         where = "at" if self.pose else "with the best guess"
