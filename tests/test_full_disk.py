@@ -169,4 +169,4 @@ def test_nothing_is_written_past_the_module_that_knows_of_full_disks():
         if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in WRITERS
     ]
     # within `library_writing`; and a copy of doubtful photos, of which nothing hangs
-    assert found == ["apps/export/colmap.py: write_text", "cli/photo_run.py: write_bytes"]
+    assert found == ["apps/export/colmap.py: write_text"]
