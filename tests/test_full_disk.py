@@ -168,5 +168,5 @@ def test_nothing_is_written_past_the_module_that_knows_of_full_disks():
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in WRITERS
     ]
-    # within `library_writing`; and a copy of doubtful photos, of which nothing hangs
+    # within `library_writing`
     assert found == ["apps/export/colmap.py: write_text"]
