@@ -191,7 +191,8 @@ def record(run: Run, answer: Answer, write: Write) -> None:
     write_steps(run, result.pano, answer.steps)
     write(result.to_json())
     run.counts[result.status] += 1
-    if result.pose is None and not result.cameras:
+    was_read = result.probability_none is not None
+    if was_read and result.pose is None and not result.cameras:
         run.are_mirrored.append(Reason.MIRRORED in result.belief.ruled_out)
 
 

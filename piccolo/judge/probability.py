@@ -39,7 +39,7 @@ LEAST_LOGIT_SCORE = 0.02
 LEAST_DRAWN = 0.01
 MOST_RATIO = 1.2
 # Of 33 crops of a house and a hospital at their right poses three fit nearly as well mirrored, where the
-# building is symmetric; of wrong poses nearly all do.
+# building is symmetric; of 16 wrong poses eleven did.
 SYMMETRIC = 0.08  # share of right poses whose photo fits as well mirrored
 CONTRADICTED_ODDS = 0.01  # odds that the user's prior knowledge is wrong
 # By tools/benchmark.py calibration. Each feature counts in one direction only.

@@ -2,6 +2,7 @@
 
 A first look by whole views finds most upright photos of the whole sphere, without local features. Only
 features show that a photo is mirrored, so the first look briefly searches its mirror image too.
+If that fits clearly better, the photo was turned over, and is searched no further.
 """
 
 import math

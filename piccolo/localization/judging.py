@@ -159,5 +159,6 @@ def describe_case(problem: Problem, case: Case, belief: Belief) -> Step:
         "std_of_fit": case.measured.errors.std_of_fit,
         "conflict": case.geometry.conflict if case.geometry else 0.0,
         "is_mirrored": case.is_mirrored,
+        "mirrored": case.mirrored and case.mirrored._asdict(),
         **describe_selection(problem, case.found),
     }

@@ -39,9 +39,7 @@ from .bundle import EVEN_ODDS, compare_errors
 from .optima import spread_optima
 from .spot import LEAST_AT_SPOT, Positioned, Spot, compute_density, fit_spot, gather
 
-NUM_SEARCHED = (
-    12  # rotations at a spot, the best of all, that are turned further to where the photo fits best
-)
+NUM_SEARCHED = 12  # rotations at a spot, the best of all, that are turned to where the photo fits best
 NUM_HELD = 4  # poses of a photo that are held at a spot
 LEAST_HELD = 0.7  # chosen: their score, divided by the best one's
 FITS_THERE = 0.9  # chosen: score of a pose that was turned at a spot, divided by that of where it fits best
