@@ -27,9 +27,10 @@ from piccolo.together.at_spot import (
     fits_mirrored,
     hold_at_spots,
     hold_turned,
-    search_at_spots,
     search_rotations,
+    spread_rotations,
     turn_at,
+    turn_each,
 )
 from piccolo.together.group import take_average
 from piccolo.together.spot import fit_spot
@@ -120,15 +121,35 @@ def test_a_photo_is_turned_only_where_it_fits():
     problem, true_pose = _photo()
     best = examine(problem, true_pose)
     here = _spot(true_pose.center_world)
-    held = hold_turned(problem, best.pose, here, _nearby(here), 0.9 * best.score, rooms.WORKERS)
+    held = hold_turned(problem, best, [], here, _nearby(here), 0.9 * best.score, rooms.WORKERS)
     rooms.assert_near(held.gaussian.pose, true_pose, 0.04, 1.0)
     assert held.candidate.log_by_others > 2.0
     assert held.gaussian.largest_std < 0.1
     assert held.is_turned
     assert held.exact.likelihood_ratio == 1.0, "it began there"
     beside = _spot(true_pose.center_world + np.array([0.7, 0.4, 0.0]))
-    start = turn_at(problem, true_pose, beside)
-    assert hold_turned(problem, start, beside, _nearby(beside), 0.9 * best.score, rooms.WORKERS) is None
+    start = examine(problem, turn_at(problem, true_pose, beside))
+    assert hold_turned(problem, start, [], beside, _nearby(beside), 0.9 * best.score, rooms.WORKERS) is None
+
+
+def test_rotations_at_a_spot_that_fit_alike_are_errors_of_each_other():
+    """The nearer their odds, the more; far away, they are other answers."""
+    problem, true_pose = _photo()
+    best = examine(problem, true_pose)
+
+    def spread_by(turn, score):
+        """The standard deviation [rad] about the vertical by one other rotation."""
+        R = yaw_rotation(turn) @ true_pose.R_cam_from_world
+        scale = np.sqrt(score / best.score)
+        alike = best.comparison._replace(correlation=scale * best.comparison.correlation)
+        other = replace(best, pose=Pose(R, true_pose.center_world), score=score, comparison=alike)
+        covariance = spread_rotations(problem, true_pose, best, [best, other])
+        assert not covariance[3:].any(), "all are at one position"
+        return math.sqrt(np.trace(covariance[:3, :3]))
+
+    assert spread_by(0.1, best.score) == pytest.approx(0.1 / math.sqrt(2.0), rel=0.01)
+    assert 0.0 < spread_by(0.1, 0.5 * best.score) < 0.03
+    assert spread_by(0.3, best.score) == 0.0
 
 
 def test_where_others_were_taken_decides_between_poses_that_fit_alike():
@@ -153,7 +174,7 @@ def test_rotations_are_searched_at_a_spot_where_no_pose_was_found():
     away = Pose(yaw_rotation(2.0) @ true_pose.R_cam_from_world, true_pose.center_world)
     found = Found(problem, Selection(examine(problem, away), ()), None)
     here = _nearby(_spot(true_pose.center_world))
-    held = search_at_spots(found, here, rooms.means(rooms.KNOWN))
+    held = turn_each(found, [], here.spots[0], here, True, rooms.means(rooms.KNOWN))
     best = max(held, key=lambda one: one.candidate.score)
     rooms.assert_near(best.gaussian.pose, true_pose, 0.03, 1.0)
     chosen, one = hold_at_spots(found, here, rooms.means(rooms.KNOWN))
@@ -247,7 +268,8 @@ def test_a_mean_far_from_where_a_photo_was_found_is_turned_instead(monkeypatch):
     monkeypatch.setattr(at_spot, "spread_optima", lambda *_: np.zeros((6, 6)))
     found = Found(problem, Selection(candidate, ()), None)
     here = _nearby(_spot(true_pose.center_world))
-    held = at_spot.hold_best(found, candidate, here, rooms.WORKERS)
+    assert at_spot.hold_best(found, candidate, here, rooms.WORKERS).shares.at_spot == 0.0
+    (held,) = turn_each(found, [candidate], here.spots[0], here, False, rooms.means(rooms.KNOWN))
     assert held.candidate.pose.distance(beside) > 0.1
     rooms.assert_near(held.gaussian.pose, true_pose, 0.05, 1.0)
     close = Errors(_gaussian(true_pose, 0.3), 0.01)
@@ -269,7 +291,7 @@ def test_other_rotations_are_searched_unless_the_photo_itself_tells_that_it_is_a
     asked = []
     monkeypatch.setattr(at_spot, "estimate_pose_errors", lambda *_: Errors(_gaussian(pose, std), 0.01))
     monkeypatch.setattr(at_spot, "spread_optima", lambda *_: np.zeros((6, 6)))
-    monkeypatch.setattr(at_spot, "search_at_spots", lambda *given: asked.append(given) or [])
+    monkeypatch.setattr(at_spot, "search_rotations", lambda *given: asked.append(given) or [])
     found = Found(problem, Selection(examine(problem, pose), ()), None)
     nearby = _nearby(_spot(true_pose.center_world))
     _, held = hold_at_spots(found, nearby, rooms.means(rooms.KNOWN))

@@ -14,6 +14,7 @@ from piccolo.judge.result import Result
 from piccolo.together import group
 from piccolo.together.group import Grouped, list_strays, localize_rest
 from piccolo.together.members import Shot
+from piccolo.together.nearby import Located
 
 TIER = "pure"
 
@@ -35,11 +36,13 @@ def _sure_at(x, *others):
 def asked(monkeypatch):
     """Let photos be found near the others from the round that is told for each; note who was asked for."""
     calls = []
+    given = []
     found_in = {}
 
     def localize_nearby(scan_map, shot, alone, located, means):
         number = shot.panorama
         calls.append((number, len(located)))
+        given.append(located)
         sure_with, found_with = found_in[number]
         result = SURE if len(located) >= sure_with else UNSURE
         held = SimpleNamespace(alone=_gaussian(0.1 * number))
@@ -52,7 +55,7 @@ def asked(monkeypatch):
     monkeypatch.setattr(group, "localize_nearby", localize_nearby)
     monkeypatch.setattr(group, "doubt_stray", doubt_stray)
     monkeypatch.setattr(group, "take_average", lambda result, *_: result)
-    return SimpleNamespace(calls=calls, found_in=found_in)
+    return SimpleNamespace(calls=calls, given=given, found_in=found_in)
 
 
 def _localize(grouped):
@@ -78,6 +81,18 @@ def test_without_news_nobody_is_asked_again(asked):
     assert asked.calls == [(3, 3)]
 
 
+def test_one_photo_that_is_sure_of_its_place_tells_the_others_if_not_how_exactly(asked):
+    """It may be found more exactly by those that it helped."""
+    is_vague = replace(SURE, status="not_localized", belief=make_belief([0.95], 0.5), gaussian=_gaussian(0.0))
+    grouped = {0: Grouped(is_vague, ()), 1: Grouped(UNSURE, ())}
+    asked.found_in |= {0: (1, 1), 1: (1, 1)}
+    rest = _localize(grouped)
+    assert rest[1] == Grouped(SURE, (0,))
+    assert rest[0] == Grouped(SURE, (1,))
+    assert asked.calls == [(1, 1), (0, 1)]
+    assert [one.probability for (one,) in asked.given] == [0.95, 0.0], "who was found is no further evidence"
+
+
 def test_a_sure_photo_elsewhere_is_doubted_and_helps_nobody(asked):
     grouped = {k: _sure_at(0.1 * k) for k in range(3)} | {3: _sure_at(8.0), 4: Grouped(UNSURE, ())}
     asked.found_in[4] = (9, 9)
@@ -93,4 +108,4 @@ def test_one_that_is_there_together_with_another_is_not_doubted(asked):
 
 @pytest.mark.parametrize(("positions", "strays"), [((0, 0.3, 0.6, 9), [3]), ((0, 0.3, 9), []), ((0, 9), [])])
 def test_photos_at_no_spot_are_strays_if_others_are_at_one(positions, strays):
-    assert list_strays({k: _gaussian(x) for k, x in enumerate(positions)}) == strays
+    assert list_strays({k: Located(_gaussian(x), 0.95) for k, x in enumerate(positions)}) == strays

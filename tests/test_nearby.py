@@ -17,8 +17,10 @@ from piccolo.judge.by_others import (
     MISSED,
     NearbyErrors,
     NearbyShares,
+    Prospect,
     believe_exact,
     believe_nearby,
+    believe_one_of,
     log_odds_nearby,
     share_nearby,
     weigh_stray,
@@ -35,6 +37,7 @@ from piccolo.together.members import Shot
 from piccolo.together.nearby import (
     REACH,
     TAKEN_ELSEWHERE,
+    Located,
     compute_odds_elsewhere,
     doubt_stray,
     keep_near,
@@ -47,12 +50,19 @@ TIER = "scene"
 
 def test_a_place_is_as_much_likelier_as_less_of_the_scan_is_within_reach():
     near = make_belief([0.6, 0.1], within=0.95)
-    found = believe_nearby(near, 0.0, gain=30.0)
+    found = believe_nearby(near, Prospect(0.0, 30.0, 1.0))
     odds = np.array([0.6, 0.1]) / 0.3 * 30.0 * IS_NEARBY
     assert found.place == pytest.approx([*(odds / (odds.sum() + 1.0)), 1.0 / (odds.sum() + 1.0)])
     assert found.place[1] / found.place[0] == pytest.approx(1.0 / 6.0), (
         "which of the places there is not told"
     )
+
+
+def test_a_photo_is_no_surer_than_the_others_are_of_their_place():
+    sure = believe_nearby(make_belief([0.999]), Prospect(0.0, 1e6, 0.95))
+    assert sure.place[0] == pytest.approx(0.95)
+    assert believe_one_of([0.9]) == pytest.approx(0.9)
+    assert believe_one_of([0.9, 0.8, 0.0]) == pytest.approx(0.98)
 
 
 def test_others_make_no_pose_exact_of_which_the_photo_shows_little():
@@ -88,8 +98,11 @@ def test_places_at_a_spot_are_likelier_than_elsewhere_and_together_as_likely_as_
 
 def test_a_photo_that_may_be_elsewhere_and_one_that_is_ruled_out_stay_so():
     near = make_belief([0.7])
-    assert believe_nearby(near, 20.0, 10.0).place[0] < believe_nearby(near, 0.0, 10.0).place[0]
-    mirrored = believe_nearby(replace(near, doubt=0.2).rule_out(Reason.MIRRORED), 0.0, 10.0)
+    assert (
+        believe_nearby(near, Prospect(20.0, 10.0, 1.0)).place[0]
+        < believe_nearby(near, Prospect(0.0, 10.0, 1.0)).place[0]
+    )
+    mirrored = believe_nearby(replace(near, doubt=0.2).rule_out(Reason.MIRRORED), Prospect(0.0, 10.0, 1.0))
     assert mirrored.ruled_out == {Reason.MIRRORED}
     assert mirrored.doubt == 0.2
 
@@ -126,7 +139,7 @@ def test_only_what_is_within_reach_of_a_pose_is_searched():
 def _measure(poses, std=0.01):
     """Poses in the map, as sure photos tell them."""
     errors = np.diag(np.repeat([1e-4, std**2], 3))
-    return [PoseGaussian(pose, errors, np.zeros((6, 6))) for pose in poses]
+    return [Located(PoseGaussian(pose, errors, np.zeros((6, 6))), 0.999) for pose in poses]
 
 
 def _nearby(located, alone, min_confidence=0.9):

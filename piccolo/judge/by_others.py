@@ -59,17 +59,30 @@ def believe_together(
     return make_belief([place, *(left * bundles[1:-1])], within)
 
 
-def believe_nearby(near: Belief, elsewhere: float, gain: float) -> Belief:
+class Prospect(NamedTuple):
+    """What is known of a photo before it is searched where others of its group were taken."""
+
+    elsewhere: float  # odds of its places if it was not taken with them
+    gain: float  # how many times larger the whole scan is than its part near the others
+    trust: float  # probability that the others are where they seem to be
+
+
+def believe_nearby(near: Belief, prospect: Prospect) -> Belief:
     """Return the belief in a photo that was searched where others of its group were taken.
 
-    `near` is the belief by the photo alone, as if the whole scan had been searched, which is `gain` times as
-    large as the part near the others. `elsewhere` are the odds of its places if it was not taken with them.
+    `near` is the belief by the photo alone, as if the whole scan had been searched. A place that looks like
+    that of the others deceives all of them, so the photo is not surer than they are.
     """
     odds = np.array(near.place[:-1]) / max(near.place[-1], LEAST_NONE)
-    here = IS_NEARBY * gain * odds
-    rest = 1.0 + (1.0 - IS_NEARBY) * elsewhere
-    belief = make_belief(here / (here.sum() + rest), near.within, near.doubt)
+    here = IS_NEARBY * prospect.gain * odds
+    rest = 1.0 + (1.0 - IS_NEARBY) * prospect.elsewhere
+    belief = make_belief(prospect.trust * here / (here.sum() + rest), near.within, near.doubt)
     return replace(belief, ruled_out=near.ruled_out)
+
+
+def believe_one_of(probabilities: Sequence[float]) -> float:
+    """Return the probability that one of several photos is right, each with its own evidence."""
+    return 1.0 - math.prod(1.0 - one for one in probabilities)
 
 
 def weigh_stray(near: float, far: float, num_near: int, num_far: int) -> tuple[float, float]:

@@ -37,6 +37,7 @@ from ..system.arrays import Array
 from ..system.jobs.threads import Workers
 from .bundle import EVEN_ODDS, compare_errors
 from .optima import spread_optima
+from .relation import spread_over
 from .spot import LEAST_AT_SPOT, Positioned, Spot, compute_density, fit_spot, gather
 
 NUM_SEARCHED = 12  # rotations at a spot, the best of all, that are turned to where the photo fits best
@@ -169,9 +170,11 @@ def hold_at_spots(found: Found, nearby: Nearby, means: Means) -> tuple[Found, He
     least = LEAST_HELD * found.selection.best.score
     asked = [one for one in candidates[:NUM_HELD] if one.score >= least]
     every = [hold_best(found, one, nearby, workers) for one in asked]
+    loose = [one for one, held in zip(asked, every, strict=True) if held.shares.of_spot <= EVEN_ODDS]
     every += [nearby.take_elsewhere(one) for one in candidates if not any(one is other for other in asked)]
-    if not any(one.shares.of_spot > EVEN_ODDS and not one.is_turned for one in every):
-        every += search_at_spots(found, nearby, means)  # one that was turned there may fit better turned away
+    for spot in nearby.spots:
+        own = [one for one in loose if nearby.find_likeliest(one.pose) is spot]
+        every += turn_each(found, own, spot, nearby, len(loose) == len(asked), means)
     standings = assess(problem.profile, Selection(every[0].candidate, tuple(h.candidate for h in every[1:])))
     order = np.argsort([-log_odds(standing, problem.method) for standing in standings], kind="stable")
     best, *others = suppress_near([every[k].candidate for k in order], len(every), ONE_ANSWER)
@@ -181,7 +184,7 @@ def hold_at_spots(found: Found, nearby: Nearby, means: Means) -> tuple[Found, He
 
 
 def hold_best(found: Found, candidate: Candidate, nearby: Nearby, workers: Workers) -> Held:
-    """Return a pose at the likeliest spot, or as taken elsewhere if the photo contradicts that."""
+    """Return a pose averaged with the likeliest spot, or as taken elsewhere if the spot would move it far."""
     problem = found.problem
     errors = estimate_pose_errors(problem, candidate, workers)
     errors = errors.widen(found.fit.pose_covariance) if found.fit else errors
@@ -190,41 +193,64 @@ def hold_best(found: Found, candidate: Candidate, nearby: Nearby, workers: Worke
         alone = alone.blur(spread_optima(problem, candidate, alone, workers))
     elsewhere = nearby.take_elsewhere(candidate, alone, errors.std_of_fit)
     spot = nearby.find_likeliest(candidate.pose)
-    if spot is None:
+    if spot is None or alone is None:
         return elsewhere
-    if alone is not None:
-        averaged = nearby.hold(candidate, alone, spot, errors.std_of_fit)
-        if averaged is None or averaged.moves_by(alone.pose) <= MOST_MOVED:
-            return averaged or elsewhere
-    start = turn_at(problem, candidate.pose, spot)
-    return hold_turned(problem, start, spot, nearby, FITS_THERE * candidate.score, workers) or elsewhere
+    averaged = nearby.hold(candidate, alone, spot, errors.std_of_fit)
+    return averaged if averaged and averaged.moves_by(alone.pose) <= MOST_MOVED else elsewhere
+
+
+def turn_each(
+    found: Found, own: Sequence[Candidate], spot: Spot, nearby: Nearby, is_searched: bool, means: Means
+) -> list[Held]:
+    """Return poses of a photo at a spot: its own ones turned there, and by a search of all rotations.
+
+    Of these, only those are returned that fit about as well there as where they were found.
+    """
+    problem = found.problem
+    searched = search_rotations(problem, spot, means) if is_searched else []
+    turned = examine_each(problem, [turn_at(problem, one.pose, spot) for one in own], means.workers)
+    begins = [*zip(turned, own, strict=True), *((one, found.selection.best) for one in searched[:NUM_HELD])]
+    held = [
+        hold_turned(problem, begin, [*turned, *searched], spot, nearby, FITS_THERE * fit.score, means.workers)
+        for begin, fit in begins
+    ]
+    return [one for one in held if one is not None]
 
 
 def hold_turned(
-    problem: Problem, start: Pose, spot: Spot, nearby: Nearby, least_score: float, workers: Workers
+    problem: Problem,
+    begin: Candidate,
+    rotations: Sequence[Candidate],
+    spot: Spot,
+    nearby: Nearby,
+    least_score: float,
+    workers: Workers,
 ) -> Held | None:
     """Return the pose of a photo that does not fix it, near a start; None if it does not fit at the spot.
 
-    That it is near the spot, where it began, is no evidence against a local optimum.
+    Other `rotations` there that fit about as well are errors of this one. That it is near the spot, where it
+    began, is no evidence against a local optimum.
     """
-    turned = examine(problem, refine(problem, start, workers, FULL).pose)
-    if turned.score < least_score:
+    refined = examine(problem, refine(problem, begin.pose, workers, FULL).pose)
+    if refined.score < least_score:
         return None
-    alone = estimate_loosely(problem, turned)
-    held = None if alone is None else nearby.hold(turned, alone, spot, None)
+    alone = estimate_loosely(problem, refined)
+    if alone is None:
+        return None
+    alone = alone.blur(spread_rotations(problem, refined.pose, begin, rotations))
+    held = nearby.hold(refined, alone, spot, None)
     return held and held._replace(is_turned=True, exact=held.exact._replace(likelihood_ratio=1.0))
 
 
-def search_at_spots(found: Found, nearby: Nearby, means: Means) -> list[Held]:
-    """Search the rotations of a photo at each spot; return the poses that fit about as well as the best."""
-    problem = found.problem
-    least = FITS_THERE * found.selection.best.score
-    held = [
-        hold_turned(problem, one.pose, spot, nearby, least, means.workers)
-        for spot in nearby.spots
-        for one in search_rotations(problem, spot, means)[:NUM_HELD]
-    ]
-    return [one for one in held if one is not None]
+def spread_rotations(problem: Problem, pose: Pose, begin: Candidate, rotations: Sequence[Candidate]) -> Array:
+    """Return the errors (6, 6) of a pose at a spot by other rotations there, weighted by their odds.
+
+    These are compared with the rotation from which the pose was reached: none of them was refined further.
+    """
+    near = [one for one in rotations if one is not begin and ONE_ANSWER.holds(one.pose, begin.pose)]
+    standings = assess(problem.profile, Selection(begin, tuple(near)))
+    odds = np.array([log_odds(standing, problem.method) for standing in standings])
+    return spread_over([pose, *(one.pose for one in near)], pose, np.exp(odds - odds.max()))
 
 
 def search_rotations(problem: Problem, spot: Spot, means: Means) -> list[Candidate]:

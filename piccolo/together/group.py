@@ -33,7 +33,7 @@ from .expected import locate_all
 from .links import FIRM, WEAK, Links, Placed, Places, are_bridged, compute_new, find_links, spread
 from .members import Member, Shot, find_members
 from .mirrored import refuse_mirrored
-from .nearby import doubt_stray, localize_nearby
+from .nearby import Located, doubt_stray, localize_nearby
 from .optima import widen_unsure
 from .spot import LEAST_AT_SPOT, gather
 
@@ -41,7 +41,6 @@ NUM_ANCHORS = 5  # poses of a photo from which a place of the group may follow, 
 LEAST_LIKELY = 1e-3  # chosen: probability of a pose from which a place of the group may follow
 MOST_SPREAD = 12  # places of the group that are tried
 BELONGS_WEAKLY = 0.7  # chosen: probability that a photo belongs where few matches put it
-LEAST_LOCATED = 2  # photos from which it follows where the others were taken
 NUM_REST_ROUNDS = 3  # in which photos that were found near others help to find further ones
 
 
@@ -96,44 +95,79 @@ def localize_rest(
 ) -> dict[int, Grouped]:
     """Return the results of photos near where others were taken: of those not sure that are found there.
 
-    Those that are sure there help to find the others. A photo that is sure of another place is doubted. Poses
-    of photos that were sure before are averaged with where the others were taken.
+    Those that are sure of their place help to find the others. A photo that is sure of another place is
+    doubted. Poses of photos that were sure before are averaged with where the others were taken.
     """
-    sure = {k: one.result for k, one in grouped.items() if one.result.status == LOCALIZED}
-    located = {k: result.gaussian for k, result in sure.items() if result.gaussian}
-    if len(located) < LEAST_LOCATED:
-        return {}
+    results = {k: one.result for k, one in grouped.items()}
+    sure = {k: one for k, one in results.items() if one.status == LOCALIZED}
+    located = {k: locate(one) for k, one in results.items() if knows_place(one, shots[k].settings.demand)}
     strays = [k for k in list_strays(located) if not grouped[k].others]
     located = {k: one for k, one in located.items() if k not in strays}
-    rest: dict[int, Grouped] = {}
-    left = [k for k in grouped if k not in sure]
-    for _ in range(NUM_REST_ROUNDS):
-        known = list(located.values())
-        asked = {k: localize_nearby(scan_map, shots[k], grouped[k].result, known, means) for k in left}
-        found = {k: one for k, one in asked.items() if one}
-        rest |= {k: Grouped(one.result, tuple(located)) for k, one in found.items()}
-        newly = {k: one.held.alone for k, one in found.items() if one.result.status == LOCALIZED}
-        joined = {k: alone for k, alone in newly.items() if alone}
-        left = [k for k in found if k not in joined]
-        if not joined:
-            break
-        located |= joined
+    rest, located = find_near_others(scan_map, shots, results, located, means)
     known = list(located.values())
     for k in strays:
-        doubted = doubt_stray(scan_map, shots[k], sure[k], known, len(strays) - 1, means)
-        rest[k] = Grouped(doubted, tuple(located))
-    for k, mean in zip(located, average_each(known), strict=True):
+        if k in sure and known:
+            doubted = doubt_stray(scan_map, shots[k], sure[k], known, len(strays) - 1, means)
+            rest[k] = Grouped(doubted, tuple(located))
+    for k, mean in zip(located, average_each([one.gaussian for one in known]), strict=True):
         if k in sure:
             averaged = take_average(sure[k], mean, scan_map, shots[k].settings.demand)
             rest[k] = grouped[k]._replace(result=averaged)
     return rest
 
 
-def list_strays(located: Mapping[int, PoseGaussian]) -> list[int]:
+def find_near_others(
+    scan_map: ScanMap,
+    shots: Sequence[Shot],
+    results: Mapping[int, Result],
+    located: Mapping[int, Located],
+    means: Means,
+) -> tuple[dict[int, Grouped], dict[int, Located]]:
+    """Search the photos that are not localized near those that are sure of their place, in rounds.
+
+    Return the results of those that were found, and all that are sure of their place then.
+    """
+    rest: dict[int, Grouped] = {}
+    located = dict(located)
+    left = [k for k, one in results.items() if one.status != LOCALIZED]
+    for _ in range(NUM_REST_ROUNDS):
+        joined: dict[int, Located] = {}
+        asked, left = left, []
+        for k in asked:
+            others = {n: one for n, one in located.items() if n != k}
+            if not others:
+                left.append(k)
+                continue
+            found = localize_nearby(scan_map, shots[k], results[k], list(others.values()), means)
+            if found is None:
+                continue
+            rest[k] = Grouped(found.result, tuple(others))
+            if found.result.status == LOCALIZED and found.held.alone:
+                joined[k] = Located(found.held.alone, 0.0)
+            else:
+                left.append(k)
+        if not joined:
+            break
+        located |= {k: one for k, one in joined.items() if k not in located}
+    return rest, located
+
+
+def knows_place(result: Result, demand: Demand) -> bool:
+    """Return True if a photo is sure of its place, whether or not its position there is exact enough."""
+    return result.gaussian is not None and result.belief.best_place >= demand.min_confidence
+
+
+def locate(result: Result) -> Located:
+    """Return where a photo was taken that is sure of its place."""
+    assert result.gaussian is not None
+    return Located(result.gaussian, result.belief.best_place)
+
+
+def list_strays(located: Mapping[int, Located]) -> list[int]:
     """List the photos that were taken at no spot, if others were."""
     numbers = list(located)
-    groups = gather([one.pose for one in located.values()])
-    if max(map(len, groups)) < LEAST_AT_SPOT:
+    groups = gather([one.gaussian.pose for one in located.values()])
+    if max(map(len, groups), default=0) < LEAST_AT_SPOT:
         return []
     return [numbers[k] for group in groups if len(group) < LEAST_AT_SPOT for k in group]
 

@@ -16,7 +16,14 @@ from ..evidence.examine import examine
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
 from ..judge.belief import make_belief
-from ..judge.by_others import LEAST_NONE, believe_exact, believe_nearby, weigh_stray
+from ..judge.by_others import (
+    LEAST_NONE,
+    Prospect,
+    believe_exact,
+    believe_nearby,
+    believe_one_of,
+    weigh_stray,
+)
 from ..judge.probability import posterior
 from ..judge.result import Result
 from ..judge.selection import assess, credit_copies
@@ -37,6 +44,13 @@ TAKEN_ELSEWHERE = "the photo fits best where none of the others was taken: with 
 REACH = 1.0  # chosen: [m] from the nearest photo of those that were taken together
 
 
+class Located(NamedTuple):
+    """Where a photo was taken that is sure of its place."""
+
+    gaussian: PoseGaussian  # in the map, as the photo tells it
+    probability: float  # of that place, as the photo tells it alone; 0 if it was found by the others
+
+
 class FoundNearby(NamedTuple):
     """A photo near others."""
 
@@ -52,9 +66,9 @@ class FoundNearby(NamedTuple):
 
 
 def localize_nearby(
-    scan_map: ScanMap, shot: Shot, alone: Result, located: Sequence[PoseGaussian], means: Means
+    scan_map: ScanMap, shot: Shot, alone: Result, located: Sequence[Located], means: Means
 ) -> FoundNearby | None:
-    """Return the result of a photo within reach of others, whose poses in the map are known.
+    """Return the result of a photo within reach of others, of which it is known where they were taken.
 
     None if there is no candidate place, or if it is not likelier than not, or the photo no surer than alone.
     """
@@ -69,7 +83,7 @@ def doubt_stray(
     scan_map: ScanMap,
     shot: Shot,
     alone: Result,
-    located: Sequence[PoseGaussian],
+    located: Sequence[Located],
     num_strays: int,
     means: Means,
 ) -> Result:
@@ -89,7 +103,7 @@ def doubt_stray(
 
 
 def look_nearby(
-    scan_map: ScanMap, shot: Shot, elsewhere: float, located: Sequence[PoseGaussian], means: Means
+    scan_map: ScanMap, shot: Shot, elsewhere: float, located: Sequence[Located], means: Means
 ) -> FoundNearby | None:
     """Search a photo within reach of others and judge it there; None if there is no candidate place.
 
@@ -108,10 +122,11 @@ def look_nearby(
     if searched.selection.best.score < 0.0:
         return None
     demand = shot.settings.demand
-    nearby = Nearby(find_spots(located), len(near.sparse), demand.accuracy)
+    nearby = Nearby(find_spots([one.gaussian for one in located]), len(near.sparse), demand.accuracy)
     found, held = hold_at_spots(keep_near(searched, poses), nearby, means)
     gain = len(whole.scan_map.sparse) / len(near.sparse)
-    judged = judge_nearby(found, held, elsewhere, gain, means, demand)
+    trust = believe_one_of([one.probability for one in located])
+    judged = judge_nearby(found, held, Prospect(elsewhere, gain, trust), means, demand)
     return None if judged is None else FoundNearby(*judged, found, held, nearby)
 
 
@@ -123,13 +138,13 @@ def keep_near(found: Found, located: Sequence[Pose]) -> Found:
     return found._replace(selection=found.selection.take(near)) if near else found
 
 
-def take_poses(located: Sequence[PoseGaussian]) -> list[Pose]:
+def take_poses(located: Sequence[Located]) -> list[Pose]:
     """Return the poses without their errors."""
-    return [one.pose for one in located]
+    return [one.gaussian.pose for one in located]
 
 
 def judge_nearby(
-    found: Found, held: Held, elsewhere: float, gain: float, means: Means, demand: Demand
+    found: Found, held: Held, prospect: Prospect, means: Means, demand: Demand
 ) -> tuple[Result, float] | None:
     """Return the result of a photo for the best of its poses near others; None if nothing fixes it.
 
@@ -143,11 +158,11 @@ def judge_nearby(
     near = make_belief(posterior(standings, held.std_of_fit, problem.method)[:-1])
     odds = near.place[0] / max(near.place[-1], LEAST_NONE) / math.exp(held.candidate.log_by_others)
     within = believe_exact(held.shares, held.exact, odds)
-    belief = replace(believe_nearby(near, elsewhere, gain), within=within)
+    belief = replace(believe_nearby(near, prospect), within=within)
     there = examine(problem, held.gaussian.pose)
     at_pose = Found(problem, reported.take([there, *reported.alternatives]), fit)
     result = judge_together(at_pose, held.gaussian, belief, means, demand.min_confidence)
-    return result, gain * (1.0 - near.place[-1]) / max(near.place[-1], LEAST_NONE)
+    return result, prospect.gain * (1.0 - near.place[-1]) / max(near.place[-1], LEAST_NONE)
 
 
 def compute_odds_elsewhere(scan_map: ScanMap, alone: Result, located: Sequence[Pose]) -> float:
