@@ -15,12 +15,14 @@ from piccolo.judge.by_others import (
     IS_AT_SPOT,
     IS_NEARBY,
     MISSED,
+    MISSED_TURNED,
     NearbyErrors,
     NearbyShares,
     Prospect,
     believe_exact,
     believe_nearby,
     believe_one_of,
+    local_share,
     log_odds_nearby,
     share_nearby,
     weigh_stray,
@@ -70,15 +72,21 @@ def test_others_make_no_pose_exact_of_which_the_photo_shows_little():
     elsewhere = NearbyShares(0.0, 0.01)
     errors = NearbyErrors(1.0, 1.0, 1.0)
     for odds in (0.001, 0.05, 0.4):
-        assert believe_exact(elsewhere, errors, odds) < 0.85
-    assert believe_exact(elsewhere, errors, 4.0) > 0.9
+        assert believe_exact(elsewhere, errors, local_share(odds)) < 0.85
+    assert believe_exact(elsewhere, errors, local_share(4.0)) > 0.9
+
+
+def test_who_was_turned_to_all_sides_at_a_spot_has_seldom_missed_the_right_rotation():
+    assert local_share(1.0) == pytest.approx(0.5 * MISSED)
+    assert local_share(1.0, MISSED_TURNED) == pytest.approx(0.5 * MISSED_TURNED)
+    assert MISSED_TURNED < 0.3 * MISSED
 
 
 def test_at_a_spot_a_local_optimum_is_another_rotation():
     at_spot = NearbyShares(0.7, 0.0)
-    assert believe_exact(at_spot, NearbyErrors(1.0, 0.9, 0.0), 0.0) == pytest.approx(1.0 - 0.1 * MISSED)
-    assert believe_exact(at_spot, NearbyErrors(1.0, 0.0, 0.0), 0.0) == pytest.approx(1.0 - MISSED)
-    mixed = believe_exact(NearbyShares(0.3, 0.1), NearbyErrors(0.8, 0.8, 0.4), 1e9)
+    assert believe_exact(at_spot, NearbyErrors(1.0, 0.9, 0.0), MISSED) == pytest.approx(1.0 - 0.1 * MISSED)
+    assert believe_exact(at_spot, NearbyErrors(1.0, 0.0, 0.0), MISSED) == pytest.approx(1.0 - MISSED)
+    mixed = believe_exact(NearbyShares(0.3, 0.1), NearbyErrors(0.8, 0.8, 0.4), 0.0)
     assert mixed == pytest.approx(0.75 * 0.8 + 0.25 * 0.4)
 
 

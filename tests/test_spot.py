@@ -9,6 +9,7 @@ from scipy.stats import multivariate_normal
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian
 from piccolo.together.spot import (
+    STEADINESSES,
     LEAST_AT_SPOT,
     Positioned,
     compute_density,
@@ -188,3 +189,13 @@ def test_a_pose_is_attracted_across_the_way_and_hardly_along_it():
     np.testing.assert_array_equal(attracted.R_cam_from_world, poses[0].R_cam_from_world)
     standing = fit_spot(_measure(rng, _draw(rng, np.linspace(0.0, 6.0, 8), 0.0, 0.01)))
     assert np.linalg.norm(standing.attract(np.eye(3), AXIS + 0.3).center_world - AXIS) < 0.06
+
+
+def test_nobody_stands_steadier_than_hands_hold_a_phone():
+    """Photos that agree by chance would else tell the other side of a turn too exactly."""
+    turns = np.linspace(0.0, 2.0, 7)
+    rng = np.random.default_rng(1)
+    exact = _measure(rng, _draw(rng, turns, 0.35, 0.0), 0.001)
+    expected = fit_spot(exact).place(exact[3].pose.R_cam_from_world)
+    stds = np.sqrt(np.diag(expected.covariance))
+    assert stds == pytest.approx([STEADINESSES[0]] * 3, rel=0.25)

@@ -18,10 +18,13 @@ from ..geometry.pose_gaussian import PoseGaussian
 from ..judge.belief import make_belief
 from ..judge.by_others import (
     LEAST_NONE,
+    MISSED,
+    MISSED_TURNED,
     Prospect,
     believe_exact,
     believe_nearby,
     believe_one_of,
+    local_share,
     weigh_stray,
 )
 from ..judge.probability import posterior
@@ -157,7 +160,8 @@ def judge_nearby(
     standings = credit_copies(assess(problem.profile, reported), is_copy)
     near = make_belief(posterior(standings, held.std_of_fit, problem.method)[:-1])
     odds = near.place[0] / max(near.place[-1], LEAST_NONE) / math.exp(held.candidate.log_by_others)
-    within = believe_exact(held.shares, held.exact, odds)
+    local = local_share(odds, MISSED_TURNED if held.is_turned else MISSED)
+    within = believe_exact(held.shares, held.exact, local)
     belief = replace(believe_nearby(near, prospect), within=within)
     there = examine(problem, held.gaussian.pose)
     at_pose = Found(problem, reported.take([there, *reported.alternatives]), fit)
