@@ -9,8 +9,8 @@ from scipy.stats import multivariate_normal
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian
 from piccolo.together.spot import (
-    STEADINESSES,
     LEAST_AT_SPOT,
+    STEADINESSES,
     Positioned,
     compute_density,
     differentiate_position,
