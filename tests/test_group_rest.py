@@ -93,6 +93,12 @@ def test_one_photo_that_is_sure_of_its_place_tells_the_others_if_not_how_exactly
     assert [one.probability for (one,) in asked.given] == [0.95, 0.0], "who was found is no further evidence"
 
 
+def test_a_photo_whose_calibration_is_doubted_tells_nobody(asked):
+    doubted = replace(UNSURE, belief=make_belief([0.99], doubt=0.2), gaussian=_gaussian(0.0))
+    assert _localize({0: Grouped(doubted, ()), 1: Grouped(UNSURE, ())}) == {}
+    assert asked.calls == []
+
+
 def test_a_sure_photo_elsewhere_is_doubted_and_helps_nobody(asked):
     grouped = {k: _sure_at(0.1 * k) for k in range(3)} | {3: _sure_at(8.0), 4: Grouped(UNSURE, ())}
     asked.found_in[4] = (9, 9)

@@ -154,13 +154,13 @@ def find_near_others(
 
 def knows_place(result: Result, demand: Demand) -> bool:
     """Return True if a photo is sure of its place, whether or not its position there is exact enough."""
-    return result.gaussian is not None and result.belief.best_place >= demand.min_confidence
+    return result.gaussian is not None and result.belief.sound_places[0] >= demand.min_confidence
 
 
 def locate(result: Result) -> Located:
     """Return where a photo was taken that is sure of its place."""
     assert result.gaussian is not None
-    return Located(result.gaussian, result.belief.best_place)
+    return Located(result.gaussian, float(result.belief.sound_places[0]))
 
 
 def list_strays(located: Mapping[int, Located]) -> list[int]:
