@@ -14,7 +14,7 @@ from piccolo.judge.result import Result
 from piccolo.together import group
 from piccolo.together.group import Grouped, list_strays, localize_rest
 from piccolo.together.members import Shot
-from piccolo.together.nearby import Located
+from piccolo.together.nearby import Witness
 
 TIER = "pure"
 
@@ -114,4 +114,4 @@ def test_one_that_is_there_together_with_another_is_not_doubted(asked):
 
 @pytest.mark.parametrize(("positions", "strays"), [((0, 0.3, 0.6, 9), [3]), ((0, 0.3, 9), []), ((0, 9), [])])
 def test_photos_at_no_spot_are_strays_if_others_are_at_one(positions, strays):
-    assert list_strays({k: Located(_gaussian(x), 0.95) for k, x in enumerate(positions)}) == strays
+    assert list_strays({k: Witness(_gaussian(x), 0.95) for k, x in enumerate(positions)}) == strays

@@ -39,7 +39,7 @@ from piccolo.together.members import Shot
 from piccolo.together.nearby import (
     REACH,
     TAKEN_ELSEWHERE,
-    Located,
+    Witness,
     compute_odds_elsewhere,
     doubt_stray,
     keep_near,
@@ -147,7 +147,7 @@ def test_only_what_is_within_reach_of_a_pose_is_searched():
 def _measure(poses, std=0.01):
     """Poses in the map, as sure photos tell them."""
     errors = np.diag(np.repeat([1e-4, std**2], 3))
-    return [Located(PoseGaussian(pose, errors, np.zeros((6, 6))), 0.999) for pose in poses]
+    return [Witness(PoseGaussian(pose, errors, np.zeros((6, 6))), 0.999) for pose in poses]
 
 
 def _nearby(located, alone, min_confidence=0.9):

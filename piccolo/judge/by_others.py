@@ -63,7 +63,7 @@ def believe_together(
 
 
 class Prospect(NamedTuple):
-    """What is known of a photo before it is searched where others of its group were taken."""
+    """Chances of a photo, before it is searched where others of its group were taken."""
 
     elsewhere: float  # odds of its places if it was not taken with them
     gain: float  # how many times larger the whole scan is than its part near the others

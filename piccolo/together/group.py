@@ -33,7 +33,7 @@ from .expected import locate_all
 from .links import FIRM, WEAK, Links, Placed, Places, are_bridged, compute_new, find_links, spread
 from .members import Member, Shot, find_members
 from .mirrored import refuse_mirrored
-from .nearby import Located, doubt_stray, localize_nearby
+from .nearby import Witness, doubt_stray, localize_nearby
 from .optima import widen_unsure
 from .spot import LEAST_AT_SPOT, gather
 
@@ -100,7 +100,9 @@ def localize_rest(
     """
     results = {k: one.result for k, one in grouped.items()}
     sure = {k: one for k, one in results.items() if one.status == LOCALIZED}
-    located = {k: locate(one) for k, one in results.items() if knows_place(one, shots[k].settings.demand)}
+    located = {
+        k: make_witness(one) for k, one in results.items() if knows_place(one, shots[k].settings.demand)
+    }
     strays = [k for k in list_strays(located) if not grouped[k].others]
     located = {k: one for k, one in located.items() if k not in strays}
     rest, located = find_near_others(scan_map, shots, results, located, means)
@@ -120,9 +122,9 @@ def find_near_others(
     scan_map: ScanMap,
     shots: Sequence[Shot],
     results: Mapping[int, Result],
-    located: Mapping[int, Located],
+    located: Mapping[int, Witness],
     means: Means,
-) -> tuple[dict[int, Grouped], dict[int, Located]]:
+) -> tuple[dict[int, Grouped], dict[int, Witness]]:
     """Search the photos that are not localized near those that are sure of their place, in rounds.
 
     Return the results of those that were found, and all that are sure of their place then.
@@ -131,7 +133,7 @@ def find_near_others(
     located = dict(located)
     left = [k for k, one in results.items() if one.status != LOCALIZED]
     for _ in range(NUM_REST_ROUNDS):
-        joined: dict[int, Located] = {}
+        joined: dict[int, Witness] = {}
         asked, left = left, []
         for k in asked:
             others = {n: one for n, one in located.items() if n != k}
@@ -143,7 +145,7 @@ def find_near_others(
                 continue
             rest[k] = Grouped(found.result, tuple(others))
             if found.result.status == LOCALIZED and found.held.alone:
-                joined[k] = Located(found.held.alone, 0.0)
+                joined[k] = Witness(found.held.alone, 0.0)
             else:
                 left.append(k)
         if not joined:
@@ -157,13 +159,13 @@ def knows_place(result: Result, demand: Demand) -> bool:
     return result.gaussian is not None and result.belief.sound_places[0] >= demand.min_confidence
 
 
-def locate(result: Result) -> Located:
-    """Return where a photo was taken that is sure of its place."""
+def make_witness(result: Result) -> Witness:
+    """Return a photo that is sure of its place as one near which others are searched."""
     assert result.gaussian is not None
-    return Located(result.gaussian, float(result.belief.sound_places[0]))
+    return Witness(result.gaussian, float(result.belief.sound_places[0]))
 
 
-def list_strays(located: Mapping[int, Located]) -> list[int]:
+def list_strays(located: Mapping[int, Witness]) -> list[int]:
     """List the photos that were taken at no spot, if others were."""
     numbers = list(located)
     groups = gather([one.gaussian.pose for one in located.values()])

@@ -47,8 +47,8 @@ TAKEN_ELSEWHERE = "the photo fits best where none of the others was taken: with 
 REACH = 1.0  # chosen: [m] from the nearest photo of those that were taken together
 
 
-class Located(NamedTuple):
-    """Where a photo was taken that is sure of its place."""
+class Witness(NamedTuple):
+    """A photo that is sure of its place: others of its group are searched near it."""
 
     gaussian: PoseGaussian  # in the map, as the photo tells it
     probability: float  # of that place, as the photo tells it alone; 0 if it was found by the others
@@ -69,7 +69,7 @@ class FoundNearby(NamedTuple):
 
 
 def localize_nearby(
-    scan_map: ScanMap, shot: Shot, alone: Result, located: Sequence[Located], means: Means
+    scan_map: ScanMap, shot: Shot, alone: Result, located: Sequence[Witness], means: Means
 ) -> FoundNearby | None:
     """Return the result of a photo within reach of others, of which it is known where they were taken.
 
@@ -86,7 +86,7 @@ def doubt_stray(
     scan_map: ScanMap,
     shot: Shot,
     alone: Result,
-    located: Sequence[Located],
+    located: Sequence[Witness],
     num_strays: int,
     means: Means,
 ) -> Result:
@@ -106,7 +106,7 @@ def doubt_stray(
 
 
 def look_nearby(
-    scan_map: ScanMap, shot: Shot, elsewhere: float, located: Sequence[Located], means: Means
+    scan_map: ScanMap, shot: Shot, elsewhere: float, located: Sequence[Witness], means: Means
 ) -> FoundNearby | None:
     """Search a photo within reach of others and judge it there; None if there is no candidate place.
 
@@ -141,7 +141,7 @@ def keep_near(found: Found, located: Sequence[Pose]) -> Found:
     return found._replace(selection=found.selection.take(near)) if near else found
 
 
-def take_poses(located: Sequence[Located]) -> list[Pose]:
+def take_poses(located: Sequence[Witness]) -> list[Pose]:
     """Return the poses without their errors."""
     return [one.gaussian.pose for one in located]
 
