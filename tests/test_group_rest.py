@@ -90,7 +90,9 @@ def test_one_photo_that_is_sure_of_its_place_tells_the_others_if_not_how_exactly
     assert rest[1] == Grouped(SURE, (0,))
     assert rest[0] == Grouped(SURE, (1,))
     assert asked.calls == [(1, 1), (0, 1)]
-    assert [one.probability for (one,) in asked.given] == [0.95, 0.0], "who was found is no further evidence"
+    assert [one.probability for (one,) in asked.given] == [0.95, 0.95], (
+        "who was found hands on how sure it is"
+    )
 
 
 def test_a_photo_whose_calibration_is_doubted_tells_nobody(asked):

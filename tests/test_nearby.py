@@ -21,7 +21,6 @@ from piccolo.judge.by_others import (
     Prospect,
     believe_exact,
     believe_nearby,
-    believe_one_of,
     local_share,
     log_odds_nearby,
     share_nearby,
@@ -42,6 +41,7 @@ from piccolo.together.nearby import (
     Witness,
     compute_odds_elsewhere,
     doubt_stray,
+    find_trust,
     keep_near,
     localize_nearby,
     narrow_around,
@@ -63,8 +63,17 @@ def test_a_place_is_as_much_likelier_as_less_of_the_scan_is_within_reach():
 def test_a_photo_is_no_surer_than_the_others_are_of_their_place():
     sure = believe_nearby(make_belief([0.999]), Prospect(0.0, 1e6, 0.95))
     assert sure.place[0] == pytest.approx(0.95)
-    assert believe_one_of([0.9]) == pytest.approx(0.9)
-    assert believe_one_of([0.9, 0.8, 0.0]) == pytest.approx(0.98)
+    near, beside, far = (
+        one._replace(probability=probability)
+        for one, probability in zip(
+            _measure([Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 0.5, 9.0)]),
+            (0.92, 0.94, 0.999),
+            strict=True,
+        )
+    )
+    assert find_trust([near, far], near.gaussian.pose) == 0.92, "of another place that one tells nothing"
+    assert find_trust([near, beside, far], near.gaussian.pose) == 0.94
+    assert find_trust([far], near.gaussian.pose) == 0.0
 
 
 def test_others_make_no_pose_exact_of_which_the_photo_shows_little():

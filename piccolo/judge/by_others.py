@@ -67,7 +67,7 @@ class Prospect(NamedTuple):
 
     elsewhere: float  # odds of its places if it was not taken with them
     gain: float  # how many times larger the whole scan is than its part near the others
-    trust: float  # probability that the others are where they seem to be
+    trust: float  # probability of the place of the surest of those near it
 
 
 def believe_nearby(near: Belief, prospect: Prospect) -> Belief:
@@ -81,11 +81,6 @@ def believe_nearby(near: Belief, prospect: Prospect) -> Belief:
     rest = 1.0 + (1.0 - IS_NEARBY) * prospect.elsewhere
     belief = make_belief(prospect.trust * here / (here.sum() + rest), near.within, near.doubt)
     return replace(belief, ruled_out=near.ruled_out)
-
-
-def believe_one_of(probabilities: Sequence[float]) -> float:
-    """Return the probability that one of several photos is right, each with its own evidence."""
-    return 1.0 - math.prod(1.0 - one for one in probabilities)
 
 
 def weigh_stray(near: float, far: float, num_near: int, num_far: int) -> tuple[float, float]:

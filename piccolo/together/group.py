@@ -145,7 +145,7 @@ def find_near_others(
                 continue
             rest[k] = Grouped(found.result, tuple(others))
             if found.result.status == LOCALIZED and found.held.alone:
-                joined[k] = Witness(found.held.alone, 0.0)
+                joined[k] = Witness(found.held.alone, found.result.belief.best_place)
             else:
                 left.append(k)
         if not joined:

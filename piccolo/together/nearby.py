@@ -23,7 +23,6 @@ from ..judge.by_others import (
     Prospect,
     believe_exact,
     believe_nearby,
-    believe_one_of,
     local_share,
     weigh_stray,
 )
@@ -51,7 +50,7 @@ class Witness(NamedTuple):
     """A photo that is sure of its place: others of its group are searched near it."""
 
     gaussian: PoseGaussian  # in the map, as the photo tells it
-    probability: float  # of that place, as the photo tells it alone; 0 if it was found by the others
+    probability: float  # of that place
 
 
 class FoundNearby(NamedTuple):
@@ -128,8 +127,8 @@ def look_nearby(
     nearby = Nearby(find_spots([one.gaussian for one in located]), len(near.sparse), demand.accuracy)
     found, held = hold_at_spots(keep_near(searched, poses), nearby, means)
     gain = len(whole.scan_map.sparse) / len(near.sparse)
-    trust = believe_one_of([one.probability for one in located])
-    judged = judge_nearby(found, held, Prospect(elsewhere, gain, trust), means, demand)
+    prospect = Prospect(elsewhere, gain, find_trust(located, held.candidate.pose))
+    judged = judge_nearby(found, held, prospect, means, demand)
     return None if judged is None else FoundNearby(*judged, found, held, nearby)
 
 
@@ -139,6 +138,12 @@ def keep_near(found: Found, located: Sequence[Pose]) -> Found:
     is_near = measure_distances(centers, located) <= REACH + COARSE_SPACING
     near = list(compress(found.selection.candidates, is_near))
     return found._replace(selection=found.selection.take(near)) if near else found
+
+
+def find_trust(located: Sequence[Witness], pose: Pose) -> float:
+    """Return the probability of the place of the surest witness within reach of a pose; 0 without one."""
+    near = [one for one in located if one.gaussian.pose.distance(pose) <= REACH + COARSE_SPACING]
+    return max((one.probability for one in near), default=0.0)
 
 
 def take_poses(located: Sequence[Witness]) -> list[Pose]:
