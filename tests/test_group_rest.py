@@ -38,9 +38,20 @@ def asked(monkeypatch):
     calls = []
     given = []
     found_in = {}
+    before_each = []
 
-    def localize_nearby(scan_map, shot, alone, located, means):
-        number = shot.panorama
+    class Searched(int):
+        """A photo's number, in place of its poses near the others."""
+
+        def forget(self):
+            return self
+
+    def search_nearby(scan_map, shot, others, means, before):
+        before_each.append(before)
+        return Searched(shot.panorama)
+
+    def localize_nearby(scan_map, searched, alone, located, means, demand):
+        number = int(searched)
         calls.append((number, len(located)))
         given.append(located)
         sure_with, found_with = found_in[number]
@@ -52,10 +63,11 @@ def asked(monkeypatch):
         calls.append((shot.panorama, len(located)))
         return UNSURE
 
+    monkeypatch.setattr(group, "search_nearby", search_nearby)
     monkeypatch.setattr(group, "localize_nearby", localize_nearby)
     monkeypatch.setattr(group, "doubt_stray", doubt_stray)
     monkeypatch.setattr(group, "take_average", lambda result, *_: result)
-    return SimpleNamespace(calls=calls, given=given, found_in=found_in)
+    return SimpleNamespace(calls=calls, given=given, found_in=found_in, before_each=before_each)
 
 
 def _localize(grouped):
@@ -65,13 +77,14 @@ def _localize(grouped):
 
 def test_photos_that_are_sure_near_others_help_to_find_further_ones(asked):
     grouped = {k: _sure_at(0.1 * k) for k in range(3)} | {k: Grouped(UNSURE, ()) for k in (3, 4, 5, 6)}
-    asked.found_in |= {3: (3, 3), 4: (4, 3), 5: (9, 3), 6: (4, 4)}
+    asked.found_in |= {3: (3, 3), 4: (4, 3), 5: (9, 3), 6: (5, 4)}
     rest = _localize(grouped)
     assert rest[3].result is rest[4].result is SURE
     assert (rest[3].others, rest[4].others) == ((0, 1, 2), (0, 1, 2, 3))
     assert rest[5].result is UNSURE
-    assert 6 not in rest, "who is not found at first is not asked again"
-    assert asked.calls == [(3, 3), (4, 3), (5, 3), (6, 3), (4, 4), (5, 4), (5, 5)]
+    assert rest[6].result is SURE, "who is not found at first is asked again"
+    assert asked.calls == [(3, 3), (4, 3), (5, 3), (6, 3), (4, 4), (5, 4), (6, 4), (5, 5), (6, 5)]
+    assert asked.before_each == [None] * 4 + [4, 5, 6, 5, 6], "its poses near them are handed on"
 
 
 def test_without_news_nobody_is_asked_again(asked):

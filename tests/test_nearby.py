@@ -26,7 +26,7 @@ from piccolo.judge.by_others import (
     share_nearby,
     weigh_stray,
 )
-from piccolo.judge.candidate import NO_CANDIDATE, Selection
+from piccolo.judge.candidate import NO_CANDIDATE, NO_CHOICE, Selection
 from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result, nothing_found
 from piccolo.judge.result_parts import Alternative
@@ -34,6 +34,7 @@ from piccolo.localization.judging import Found
 from piccolo.localization.means import Means
 from piccolo.scan_map.camera_positions import COARSE_SPACING
 from piccolo.system.jobs.threads import Stopwatch
+from piccolo.together import nearby
 from piccolo.together.members import Shot
 from piccolo.together.nearby import (
     REACH,
@@ -45,6 +46,7 @@ from piccolo.together.nearby import (
     keep_near,
     localize_nearby,
     narrow_around,
+    search_nearby,
 )
 
 TIER = "scene"
@@ -163,8 +165,32 @@ def _nearby(located, alone, min_confidence=0.9):
     scan_map = rooms.scan_map(SEED)
     shot = Shot(one_taken(1)[0], replace(rooms.KNOWN, min_confidence=min_confidence))
     means = Means(rooms.KNOWN.effort, rooms.WORKERS, Stopwatch())
-    found = localize_nearby(scan_map, shot, alone, _measure(located), means)
+    searched = search_nearby(scan_map, shot, located, means)
+    if searched is None:
+        return None
+    found = localize_nearby(scan_map, searched, alone, _measure(located), means, shot.settings.demand)
     return found and found.result
+
+
+def test_a_photo_is_searched_again_only_where_it_was_not(monkeypatch):
+    scan_map = rooms.scan_map(SEED)
+    shot = Shot(one_taken(1)[0], rooms.KNOWN)
+    means = Means(rooms.KNOWN.effort, rooms.WORKERS, Stopwatch())
+    first = scan_map.from_world(true_places()[0])
+    beside, far = (replace(first, center_world=first.center_world + np.eye(3)[0] * x) for x in (0.4, 0.6))
+    found = []
+
+    def find(problem, scan_map, means):
+        found.append(len(problem.scan_map.sparse))
+        return Found(problem, NO_CHOICE, None)
+
+    monkeypatch.setattr(nearby, "find", find)
+    before = search_nearby(scan_map, shot, [first], means)
+    assert search_nearby(scan_map, shot, [first, beside], means, before) is before
+    assert len(found) == 1
+    again = search_nearby(scan_map, shot, [first, far], means, before)
+    assert len(found) == 2
+    assert again.gain == len(scan_map.sparse) / found[1] < before.gain == len(scan_map.sparse) / found[0]
 
 
 def test_a_photo_is_found_where_the_others_were_taken():

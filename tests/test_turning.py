@@ -11,7 +11,7 @@ from piccolo.evidence.blocks import fill_symmetric
 from piccolo.evidence.covariance import make_problem
 from piccolo.geometry.levenberg_marquardt import GRADIENT, LOSS, MATRIX, NUM_SUMS
 from piccolo.geometry.pose import Pose, angle_between, exp_so3
-from piccolo.localization.turning import turn, turn_equations
+from piccolo.localization.turning import turn, turn_equations, turn_roughly
 from piccolo.optimize.channel_loss import channel_equations
 
 TIER = "scene"
@@ -54,3 +54,17 @@ def test_a_photo_turns_to_where_it_fits_and_stays_where_it_is(off_deg):
     angle = math.degrees(angle_between(end.R_cam_from_world, true_pose.R_cam_from_world))
     assert angle < 0.3
     np.testing.assert_array_equal(end.center_world, true_pose.center_world)
+
+
+def test_a_photo_turns_roughly_from_far_away():
+    """From any rotation of the search, of which the nearest may be ten degrees off."""
+    problem, true_pose = _narrow()
+    starts = [
+        Pose(exp_so3(np.radians(off_deg)) @ true_pose.R_cam_from_world, true_pose.center_world)
+        for off_deg in ((0.0, 4.0, 8.0), (100.0, 0.0, 60.0))
+    ]
+    near, wrong = (turn_roughly(problem, start) for start in starts)
+    angle = math.degrees(angle_between(near.pose.R_cam_from_world, true_pose.R_cam_from_world))
+    assert angle < 1.5
+    assert near.score > 3.0 * wrong.score
+    np.testing.assert_array_equal(near.pose.center_world, true_pose.center_world)

@@ -1,16 +1,18 @@
 """The rotation of a photo whose position is known by other means."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from ..evidence.covariance import make_problem
 from ..geometry.levenberg_marquardt import GRADIENT, MATRIX, levenberg_marquardt
 from ..geometry.pose import Pose, orthonormal
+from ..judge.alternatives import Hypothesis
 from ..optimize.channel_loss import ChannelProblem, channel_equations
+from ..photo.panorama.texels import Texels
 from ..problem.problem import Problem
-from ..problem.stages import FULL, ImageName
+from ..problem.stages import FULL, MIDDLE, ImageName
 from ..system.arrays import Array
+from ..views.view import Cells
+from .ladder import score_on_cells, see_cells
 
 COARSE_TO_FINE: tuple[ImageName, ...] = ("middle", "fine", "full")
 SUMS_OF_TURN = GRADIENT, GRADIENT + 1, GRADIENT + 2, *(MATRIX + k for k in (0, 1, 2, 6, 7, 11))
@@ -32,12 +34,28 @@ def turn_equations(
 descend_turns = levenberg_marquardt(turn_equations)
 
 
-def turn(problem: Problem, pose: Pose, images: Sequence[ImageName] = COARSE_TO_FINE) -> Pose:
+def turn(problem: Problem, pose: Pose) -> Pose:
     """Return the pose at the same position whose rotation fits the photo best, on one image after another."""
-    points = problem.view_at(pose, "points").around(pose.center_world)
+    points = problem.view_at(pose, "points")
+    for image in COARSE_TO_FINE:
+        pose = turn_on(points, problem.photo.image(image), pose)
+    return pose
+
+
+def turn_roughly(problem: Problem, pose: Pose) -> Hypothesis:
+    """Return the pose at the same position whose rotation fits the photo best on coarse cells, scored there.
+
+    All rotations at a position are searched by it.
+    """
+    cells, blocks = see_cells(problem, pose, MIDDLE.view)
+    image = problem.photo.image(MIDDLE.image)
+    return score_on_cells(cells, blocks, image, turn_on(cells, image, pose))
+
+
+def turn_on(cells: Cells, image: Texels, pose: Pose) -> Pose:
+    """Return the pose at the same position whose rotation fits an image best."""
+    asked = make_problem(cells.around(pose.center_world), image)
     R_cam_from_map = pose.R_cam_from_world.copy()
     limits = FULL.limits
-    for image in images:
-        asked = make_problem(points, problem.photo.image(image))
-        descend_turns(asked, limits.num_iterations, limits.tolerance, R_cam_from_map, np.zeros(3))
+    descend_turns(asked, limits.num_iterations, limits.tolerance, R_cam_from_map, np.zeros(3))
     return Pose(orthonormal(R_cam_from_map), pose.center_world)

@@ -19,7 +19,7 @@ from ..evidence.loose_covariance import estimate_loosely
 from ..geometry.nearness import DESCENDED, ONE_ANSWER
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LIKELY, PoseGaussian
-from ..judge.alternatives import sort_by_score, suppress_near
+from ..judge.alternatives import best_distinct, sort_by_score, suppress_near
 from ..judge.by_others import LOCAL_ERRORS, NearbyErrors, NearbyShares, log_odds_nearby, share_nearby
 from ..judge.candidate import Candidate, Selection
 from ..judge.probability import log_odds
@@ -28,7 +28,7 @@ from ..localization.judging import Found
 from ..localization.ladder import refine
 from ..localization.means import Means
 from ..localization.search import list_rotations
-from ..localization.turning import turn
+from ..localization.turning import turn, turn_roughly
 from ..problem.accuracy import Accuracy
 from ..problem.problem import Problem
 from ..problem.stages import FULL
@@ -210,8 +210,9 @@ def turn_each(
     searched = search_rotations(problem, spot, means) if is_searched else []
     turned = examine_each(problem, [turn_at(problem, one.pose, spot) for one in own], means.workers)
     begins = [*zip(turned, own, strict=True), *((one, found.selection.best) for one in searched[:NUM_HELD])]
+    rotations = [*turned, *searched]
     held = [
-        hold_turned(problem, begin, [*turned, *searched], spot, nearby, FITS_THERE * fit.score, means.workers)
+        hold_turned(problem, begin, rotations, spot, nearby, FITS_THERE * fit.score, means.workers)
         for begin, fit in begins
     ]
     return [one for one in held if one is not None]
@@ -259,9 +260,8 @@ def search_rotations(problem: Problem, spot: Spot, means: Means) -> list[Candida
     tilts = "known" if problem.photo.has_tilt else problem.profile.default_tilt
     rotations = list_rotations(problem, tilts, means.effort)
     starts = [Pose(R, spot.place(R).center) for R in rotations]
-    roughly = workers.map(partial(turn, problem, images=("middle",)), starts, "descend")
-    every = sort_by_score(examine_each(problem, roughly, workers))
-    best = suppress_near(every, NUM_SEARCHED, DESCENDED)
+    roughly = workers.map(partial(turn_roughly, problem), starts, "descend")
+    best = best_distinct(roughly, NUM_SEARCHED, DESCENDED)
     turned = workers.map(lambda one: turn_at(problem, one.pose, spot), best, "descend")
     return sort_by_score(examine_each(problem, turned, workers))
 

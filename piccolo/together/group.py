@@ -33,7 +33,7 @@ from .expected import locate_all
 from .links import FIRM, WEAK, Links, Placed, Places, are_bridged, compute_new, find_links, spread
 from .members import Member, Shot, find_members
 from .mirrored import refuse_mirrored
-from .nearby import Witness, doubt_stray, localize_nearby
+from .nearby import Searched, Witness, doubt_stray, localize_nearby, search_nearby, take_poses
 from .optima import widen_unsure
 from .spot import LEAST_AT_SPOT, gather
 
@@ -130,27 +130,30 @@ def find_near_others(
     Return the results of those that were found, and all that are sure of their place then.
     """
     rest: dict[int, Grouped] = {}
+    searched: dict[int, Searched] = {}
     located = dict(located)
     left = [k for k, one in results.items() if one.status != LOCALIZED]
     for _ in range(NUM_REST_ROUNDS):
         joined: dict[int, Witness] = {}
-        asked, left = left, []
-        for k in asked:
+        for k in left:
             others = {n: one for n, one in located.items() if n != k}
-            if not others:
-                left.append(k)
+            witnesses = list(others.values())
+            near = take_poses(witnesses)
+            looked = search_nearby(scan_map, shots[k], near, means, searched.get(k)) if near else None
+            if looked is None:
                 continue
-            found = localize_nearby(scan_map, shots[k], results[k], list(others.values()), means)
+            searched[k] = looked.forget()
+            demand = shots[k].settings.demand
+            found = localize_nearby(scan_map, looked, results[k], witnesses, means, demand)
             if found is None:
                 continue
             rest[k] = Grouped(found.result, tuple(others))
             if found.result.status == LOCALIZED and found.held.alone:
                 joined[k] = Witness(found.held.alone, found.result.belief.best_place)
-            else:
-                left.append(k)
         if not joined:
             break
         located |= {k: one for k, one in joined.items() if k not in located}
+        left = [k for k in left if k not in joined]
     return rest, located
 
 

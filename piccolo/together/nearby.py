@@ -44,6 +44,7 @@ from .spot import find_spots
 
 TAKEN_ELSEWHERE = "the photo fits best where none of the others was taken: with them it is less sure"
 REACH = 1.0  # chosen: [m] from the nearest photo of those that were taken together
+AS_BEFORE = REACH / 2  # [m] from the others near which a photo was searched: it is not searched again
 
 
 class Witness(NamedTuple):
@@ -51,6 +52,23 @@ class Witness(NamedTuple):
 
     gaussian: PoseGaussian  # in the map, as the photo tells it
     probability: float  # of that place
+
+
+class Searched(NamedTuple):
+    """Poses of a photo near others, kept for a further look: more of the others may be known then."""
+
+    found: Found
+    others: Sequence[Pose]
+    gain: float  # places where the photo may have been taken in the whole scan, as a multiple of those near
+
+    def forget(self) -> "Searched":
+        """Return the poses without the images and matches, which take memory."""
+        return self._replace(found=self.found.forget())
+
+    def covers(self, others: Sequence[Pose]) -> bool:
+        """Return True if others were taken about where the photo has been searched."""
+        centers = np.array([pose.center_world for pose in others])
+        return bool((measure_distances(centers, self.others) <= AS_BEFORE).all())
 
 
 class FoundNearby(NamedTuple):
@@ -67,15 +85,40 @@ class FoundNearby(NamedTuple):
         return fits_mirrored(self.found, self.held, self.nearby, means)
 
 
+def search_nearby(
+    scan_map: ScanMap, shot: Shot, others: Sequence[Pose], means: Means, before: Searched | None = None
+) -> Searched | None:
+    """Search a photo within reach of others; None if there is no place to search.
+
+    It is not searched again if it was searched there `before`.
+    """
+    if before is not None and before.covers(others):
+        return before
+    whole = prepare_search(scan_map, shot.panorama, shot.settings, means.watch)
+    if whole is None:
+        return None
+    near = narrow_around(whole.scan_map, others)
+    if len(near.sparse) == 0:
+        return None
+    found = find(replace(whole, scan_map=near), scan_map, means)
+    gain = len(whole.scan_map.sparse) / len(near.sparse)
+    return Searched(found.confirm() if shot.is_confirmed else found, others, gain)
+
+
 def localize_nearby(
-    scan_map: ScanMap, shot: Shot, alone: Result, located: Sequence[Witness], means: Means
+    scan_map: ScanMap,
+    searched: Searched,
+    alone: Result,
+    located: Sequence[Witness],
+    means: Means,
+    demand: Demand,
 ) -> FoundNearby | None:
     """Return the result of a photo within reach of others, of which it is known where they were taken.
 
     None if there is no candidate place, or if it is not likelier than not, or the photo no surer than alone.
     """
     elsewhere = compute_odds_elsewhere(scan_map, alone, take_poses(located))
-    found = look_nearby(scan_map, shot, elsewhere, located, means)
+    found = look_nearby(searched, elsewhere, located, means, demand)
     if found is None or found.result.belief.best_place <= EVEN_ODDS:
         return None
     return found if found.result.confidence > alone.confidence and not found.fits_mirrored(means) else None
@@ -93,41 +136,33 @@ def doubt_stray(
 
     It is that near the others, if this is likelier. `num_strays` other photos are sure elsewhere too.
     """
-    elsewhere = compute_odds_elsewhere(scan_map, alone, take_poses(located))
-    found = look_nearby(scan_map, shot, elsewhere, located, means)
+    poses = take_poses(located)
+    demand = shot.settings.demand
+    elsewhere = compute_odds_elsewhere(scan_map, alone, poses)
+    searched = search_nearby(scan_map, shot, poses, means)
+    found = searched and look_nearby(searched, elsewhere, located, means, demand)
     odds = 0.0 if found is None else found.odds
     near, far = weigh_stray(odds, elsewhere, len(located), num_strays)
     if found is not None and near > far and not found.fits_mirrored(means):
         return found.result
     belief = alone.belief.scale(min(1.0, far / alone.belief.best_place))
-    doubted = alone.take_belief(belief, shot.settings.demand.min_confidence)
+    doubted = alone.take_belief(belief, demand.min_confidence)
     return replace(doubted, warnings=(*doubted.warnings, TAKEN_ELSEWHERE))
 
 
 def look_nearby(
-    scan_map: ScanMap, shot: Shot, elsewhere: float, located: Sequence[Witness], means: Means
+    searched: Searched, elsewhere: float, located: Sequence[Witness], means: Means, demand: Demand
 ) -> FoundNearby | None:
-    """Search a photo within reach of others and judge it there; None if there is no candidate place.
+    """Judge a photo that was searched within reach of others; None if there is no candidate place.
 
     `elsewhere` are the odds of its places beyond reach, as of `compute_odds_elsewhere`.
     """
-    whole = prepare_search(scan_map, shot.panorama, shot.settings, means.watch)
-    if whole is None:
+    if searched.found.selection.best.score < 0.0:
         return None
-    poses = take_poses(located)
-    near = narrow_around(whole.scan_map, poses)
-    if len(near.sparse) == 0:
-        return None
-    problem = replace(whole, scan_map=near)
-    searched = find(problem, scan_map, means)
-    searched = searched.confirm() if shot.is_confirmed else searched
-    if searched.selection.best.score < 0.0:
-        return None
-    demand = shot.settings.demand
-    nearby = Nearby(find_spots([one.gaussian for one in located]), len(near.sparse), demand.accuracy)
-    found, held = hold_at_spots(keep_near(searched, poses), nearby, means)
-    gain = len(whole.scan_map.sparse) / len(near.sparse)
-    prospect = Prospect(elsewhere, gain, find_trust(located, held.candidate.pose))
+    num_near = len(searched.found.problem.scan_map.sparse)
+    nearby = Nearby(find_spots([one.gaussian for one in located]), num_near, demand.accuracy)
+    found, held = hold_at_spots(keep_near(searched.found, take_poses(located)), nearby, means)
+    prospect = Prospect(elsewhere, searched.gain, find_trust(located, held.candidate.pose))
     judged = judge_nearby(found, held, prospect, means, demand)
     return None if judged is None else FoundNearby(*judged, found, held, nearby)
 
