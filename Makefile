@@ -1,7 +1,7 @@
 # make demo          set up, localize the photos of examples/flat, print the errors against the true poses, write a report
 # make test          set up, run the tests that start no processes, but those of research/
 # make test-all      set up, run every test but those of the report's page
-# make test-kernels  set up, run the numerical tests once without compiling and once with array bounds checked
+# make test-kernels  set up, run the numerical tests without compiling, so that array bounds are checked
 # make test-browser  set up, run the tests of the report's page in Chromium (apt-get install chromium npm)
 # make test-wide     set up, try what photos and scans say wrongly of themselves; not in CI, some twenty minutes
 # make check         set up, lint, format and types
@@ -15,7 +15,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-all test-kernels kernels-plain kernels-checked test-browser test-lowest test-wide check check-page lock release clean
+.PHONY: demo test test-all test-kernels test-browser test-lowest test-wide check check-page lock release clean
 
 $(VENV)/ready: requirements.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "found $$($(PYTHON) --version), wanted Python 3.11 or newer: make PYTHON=python3.11" >&2; exit 1; }
@@ -47,13 +47,8 @@ test-all: $(VENV)/ready
 # of the tests of kernels, those that need seconds in plain Python
 KERNELS := channel_loss cone cloud_morton cloud_octree cloud_profiles local_features_sift p3p pose sampling_loss sphere zbuffer
 
-test-kernels: kernels-plain kernels-checked
-
-kernels-plain: $(VENV)/ready
+test-kernels: $(VENV)/ready
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNELS:%=tests/test_%.py)
-
-kernels-checked: $(VENV)/ready
-	NUMBA_BOUNDSCHECK=1 $(BIN)/python -m pytest $(KERNELS:%=tests/test_%.py)
 
 # tests that call each library, and Numba's insides; and golden poses
 LOWEST := cache camera_files cloud_e57 cloud_las cloud_mesh cloud_pcd cloud_ply cloud_units cluster doors export export_models export_rerun export_tables localize panorama_formats pose p3p report_plan_file result service sphere threads memory view video

@@ -32,8 +32,8 @@ from piccolo.together.at_spot import (
     turn_at,
     turn_each,
 )
-from piccolo.together.group import take_average
 from piccolo.together.spot import fit_spot
+from piccolo.together.unsure import take_average
 
 TIER = "scene"
 

@@ -12,7 +12,7 @@ from piccolo.judge.result import nothing_found
 from piccolo.photo.camera.model import camera_of_fov
 from piccolo.system.errors import InputError
 from piccolo.system.jobs.threads import Workers
-from piccolo.together.group import Grouped
+from piccolo.together.members import Grouped
 from research.measuring import benchmark, groups
 from research.synthetic import handheld
 from research.synthetic.layout import make_room

@@ -21,9 +21,9 @@ from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
 from ..system.jobs.threads import Stopwatch, Workers, one_blas_thread
 from .beside import recall_gaussian
-from .group import NUM_ANCHORS, Grouped, localize_linked
+from .group import NUM_ANCHORS, localize_linked
 from .links import FIRM, WEAK, Placed, find_links, match_each, spread
-from .members import Member, Shot, check_photos, find_alone
+from .members import Grouped, Member, Shot, check_photos, find_alone
 
 
 class Known(NamedTuple):

@@ -3,12 +3,11 @@
 Each photo is searched by itself. From each likely pose of a photo, the poses of the others follow by their
 matches (`links`); these poses together are called a place of the group. The best places are tested in every
 photo, and weighed as poses of a bundle are. Photos that do not belong to the best place may belong to
-another; else each keeps its own result.
+another. The others are searched near those that are sure (`unsure`); else each keeps its own result.
 """
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from hashlib import sha256
 from typing import NamedTuple
 
@@ -16,9 +15,8 @@ import numpy as np
 
 from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose
-from ..geometry.pose_gaussian import LIKELY, PoseGaussian
+from ..geometry.pose_gaussian import LIKELY
 from ..judge.by_others import Shares
-from ..judge.conclude import take_pose
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result
 from ..localization.means import Means
@@ -26,22 +24,19 @@ from ..problem.accuracy import Demand
 from ..scan_map.scan_map import ScanMap
 from ..system.arrays import Array
 from ..system.jobs.threads import Stopwatch, Workers, one_blas_thread
-from .at_spot import average_each
 from .bundle import EVEN_ODDS, judge_placed, place_between
 from .bundle_search import NUM_BUNDLES, Support, find_supports, weigh_bundles
 from .expected import locate_all
 from .links import FIRM, WEAK, Links, Placed, Places, are_bridged, compute_new, find_links, spread
-from .members import Member, Shot, find_members
+from .members import Grouped, Member, Shot, find_members
 from .mirrored import refuse_mirrored
-from .nearby import Searched, Witness, doubt_stray, localize_nearby, search_nearby, take_poses
 from .optima import widen_unsure
-from .spot import LEAST_AT_SPOT, gather
+from .unsure import localize_rest
 
 NUM_ANCHORS = 5  # poses of a photo from which a place of the group may follow, the likeliest
 LEAST_LIKELY = 1e-3  # chosen: probability of a pose from which a place of the group may follow
 MOST_SPREAD = 12  # places of the group that are tried
 BELONGS_WEAKLY = 0.7  # chosen: probability that a photo belongs where few matches put it
-NUM_REST_ROUNDS = 3  # in which photos that were found near others help to find further ones
 
 
 class Group(NamedTuple):
@@ -56,13 +51,6 @@ class Tested(NamedTuple):
 
     places: Places
     supports: dict[int, Support]
-
-
-class Grouped(NamedTuple):
-    """The result of a photo, and the photos with which it was localized together."""
-
-    result: Result
-    others: tuple[int, ...]  # numbers of these photos; empty if it was localized alone
 
 
 @one_blas_thread()
@@ -88,102 +76,6 @@ def localize_group(
         Grouped(grouped[k].result, tuple(sorted(order[other] for other in grouped[k].others)))
         for k in np.argsort(order)
     ]
-
-
-def localize_rest(
-    scan_map: ScanMap, shots: Sequence[Shot], grouped: Mapping[int, Grouped], means: Means
-) -> dict[int, Grouped]:
-    """Return the results of photos near where others were taken: of those not sure that are found there.
-
-    Those that are sure of their place help to find the others. A photo that is sure of another place is
-    doubted. Poses of photos that were sure before are averaged with where the others were taken.
-    """
-    results = {k: one.result for k, one in grouped.items()}
-    sure = {k: one for k, one in results.items() if one.status == LOCALIZED}
-    located = {
-        k: make_witness(one) for k, one in results.items() if knows_place(one, shots[k].settings.demand)
-    }
-    strays = [k for k in list_strays(located) if not grouped[k].others]
-    located = {k: one for k, one in located.items() if k not in strays}
-    rest, located = find_near_others(scan_map, shots, results, located, means)
-    known = list(located.values())
-    for k in strays:
-        if k in sure and known:
-            doubted = doubt_stray(scan_map, shots[k], sure[k], known, len(strays) - 1, means)
-            rest[k] = Grouped(doubted, tuple(located))
-    for k, mean in zip(located, average_each([one.gaussian for one in known]), strict=True):
-        if k in sure:
-            averaged = take_average(sure[k], mean, scan_map, shots[k].settings.demand)
-            rest[k] = grouped[k]._replace(result=averaged)
-    return rest
-
-
-def find_near_others(
-    scan_map: ScanMap,
-    shots: Sequence[Shot],
-    results: Mapping[int, Result],
-    located: Mapping[int, Witness],
-    means: Means,
-) -> tuple[dict[int, Grouped], dict[int, Witness]]:
-    """Search the photos that are not localized near those that are sure of their place, in rounds.
-
-    Return the results of those that were found, and all that are sure of their place then.
-    """
-    rest: dict[int, Grouped] = {}
-    searched: dict[int, Searched] = {}
-    located = dict(located)
-    left = [k for k, one in results.items() if one.status != LOCALIZED]
-    for _ in range(NUM_REST_ROUNDS):
-        joined: dict[int, Witness] = {}
-        for k in left:
-            others = {n: one for n, one in located.items() if n != k}
-            witnesses = list(others.values())
-            near = take_poses(witnesses)
-            looked = search_nearby(scan_map, shots[k], near, means, searched.get(k)) if near else None
-            if looked is None:
-                continue
-            searched[k] = looked.forget()
-            demand = shots[k].settings.demand
-            found = localize_nearby(scan_map, looked, results[k], witnesses, means, demand)
-            if found is None:
-                continue
-            rest[k] = Grouped(found.result, tuple(others))
-            if found.result.status == LOCALIZED and found.held.alone:
-                joined[k] = Witness(found.held.alone, found.result.belief.best_place)
-        if not joined:
-            break
-        located |= {k: one for k, one in joined.items() if k not in located}
-        left = [k for k in left if k not in joined]
-    return rest, located
-
-
-def knows_place(result: Result, demand: Demand) -> bool:
-    """Return True if a photo is sure of its place, whether or not its position there is exact enough."""
-    return result.gaussian is not None and result.belief.sound_places[0] >= demand.min_confidence
-
-
-def make_witness(result: Result) -> Witness:
-    """Return a photo that is sure of its place as one near which others are searched."""
-    assert result.gaussian is not None
-    return Witness(result.gaussian, float(result.belief.sound_places[0]))
-
-
-def list_strays(located: Mapping[int, Witness]) -> list[int]:
-    """List the photos that were taken at no spot, if others were."""
-    numbers = list(located)
-    groups = gather([one.gaussian.pose for one in located.values()])
-    if max(map(len, groups), default=0) < LEAST_AT_SPOT:
-        return []
-    return [numbers[k] for group in groups if len(group) < LEAST_AT_SPOT for k in group]
-
-
-def take_average(result: Result, mean: PoseGaussian, scan_map: ScanMap, demand: Demand) -> Result:
-    """Return the result of a sure photo with its pose averaged with where others were taken."""
-    if mean is result.gaussian:
-        return result
-    within = max(demand.accuracy.probability(mean), result.belief.within)
-    belief = replace(result.belief, within=within)
-    return take_pose(result, mean, scan_map).take_belief(belief, demand.min_confidence)
 
 
 def localize_linked(members: Mapping[int, Member], means: Means, demand: Demand) -> dict[int, Grouped]:

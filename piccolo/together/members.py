@@ -56,6 +56,13 @@ class Member:
         return list(zip(self.found.selection.candidates, places, strict=False))
 
 
+class Grouped(NamedTuple):
+    """The result of a photo, and the photos with which it was localized together."""
+
+    result: Result
+    others: tuple[int, ...]  # numbers of these photos; empty if it was localized alone
+
+
 MEMORY_OF_PHOTO = 4e7  # [byte] that a photo keeps while others are localized; 23e6 of 1024 x 768 px measured
 
 

@@ -11,10 +11,10 @@ from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian
 from piccolo.judge.belief import make_belief
 from piccolo.judge.result import Result
-from piccolo.together import group
-from piccolo.together.group import Grouped, list_strays, localize_rest
-from piccolo.together.members import Shot
+from piccolo.together import unsure
+from piccolo.together.members import Grouped, Shot
 from piccolo.together.nearby import Witness
+from piccolo.together.unsure import list_strays, localize_rest
 
 TIER = "pure"
 
@@ -63,10 +63,10 @@ def asked(monkeypatch):
         calls.append((shot.panorama, len(located)))
         return UNSURE
 
-    monkeypatch.setattr(group, "search_nearby", search_nearby)
-    monkeypatch.setattr(group, "localize_nearby", localize_nearby)
-    monkeypatch.setattr(group, "doubt_stray", doubt_stray)
-    monkeypatch.setattr(group, "take_average", lambda result, *_: result)
+    monkeypatch.setattr(unsure, "search_nearby", search_nearby)
+    monkeypatch.setattr(unsure, "localize_nearby", localize_nearby)
+    monkeypatch.setattr(unsure, "doubt_stray", doubt_stray)
+    monkeypatch.setattr(unsure, "take_average", lambda result, *_: result)
     return SimpleNamespace(calls=calls, given=given, found_in=found_in, before_each=before_each)
 
 
