@@ -44,7 +44,7 @@ from .spot import find_spots
 
 TAKEN_ELSEWHERE = "the photo fits best where none of the others was taken: with them it is less sure"
 REACH = 1.0  # chosen: [m] from the nearest photo of those that were taken together
-AS_BEFORE = REACH / 2  # [m] from the others near which a photo was searched: it is not searched again
+AS_BEFORE = REACH / 2  # chosen: [m] from the others near which a photo was searched: it is not searched again
 
 
 class Witness(NamedTuple):
