@@ -14,7 +14,7 @@ from ..problem.profile import DRAWN_VIEW
 from ..system.jobs.threads import Workers
 from .comparison import compare
 from .contradictions import contradictions
-from .verification import draw_near, verify
+from .verification import draw_near, match_again, verify
 
 DRAWN_CHANCE = 0.2  # correlation that wrong poses reach in a block of drawn edges, which are sharp
 
@@ -28,6 +28,15 @@ def examine(problem: Problem, pose: Pose, near: Candidate | None = None) -> Cand
     comparison = compare(problem, pose)
     found = check_prior(problem, Candidate(pose, comparison.score, comparison))
     return found if near is None else replace(found, unoccluded=near.unoccluded, drawn=near.drawn)
+
+
+def examine_again(problem: Problem, before: Candidate, workers: Workers) -> Candidate:
+    """Compare the scan at a candidate's pose with the photo, whose calibration was another before.
+
+    The scan that was drawn near the pose is the same, and is only matched again.
+    """
+    drawn = before.drawn and match_again(problem, before.drawn, workers)
+    return examine(problem, before.pose, replace(before, unoccluded=None, drawn=drawn))
 
 
 def check_prior(problem: Problem, candidate: Candidate) -> Candidate:

@@ -110,6 +110,17 @@ def draw_near(problem: Problem, pose: Pose, known: Drawn | None, workers: Worker
     return Drawn(key, picture, match_located(keypoints, picture))
 
 
+def match_again(problem: Problem, known: Drawn, workers: Workers) -> Drawn | None:
+    """Match the photo's features with the scan that was drawn for the same photo with another calibration.
+
+    None if it was not drawn, as the photo had no features then.
+    """
+    if len(known.picture.keypoints.rays) == 0:
+        return None
+    keypoints = problem.photo.features(workers).keypoints
+    return known._replace(matches=match_located(keypoints, known.picture))
+
+
 def round_pose(pose: Pose) -> tuple[bytes, Pose]:
     """Return the nearest pose of the grid on which the scan is drawn, and its key."""
     place = np.rint(pose.center_world / PLACE)

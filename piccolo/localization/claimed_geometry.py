@@ -16,7 +16,7 @@ from ..evidence.claimed_sphere import (
     make_freedom,
     search_geometry,
 )
-from ..evidence.examine import examine, examine_each
+from ..evidence.examine import examine, examine_again, examine_each
 from ..evidence.focal_length import FOCAL_WIDTHS, FocalFit, fit_focal, list_matches
 from ..evidence.lens_matches import fit_matches
 from ..evidence.self_calibration import FreeEnd, descend_freely, estimate_corrections
@@ -85,8 +85,9 @@ def refine_with(
 ) -> tuple[Problem, Selection]:
     """Refine the poses with another calibration, the best one from `best`."""
     problem = recalibrate(problem, change, workers)
-    poses = [best, *(h.pose for h in found.alternatives)]
-    return problem, refine_best(problem, examine_each(problem, poses, workers), workers)
+    before = [replace(found.best, pose=best), *found.alternatives]
+    examined = workers.map(partial(examine_again, problem, workers=workers), before, "compare")
+    return problem, refine_best(problem, examined, workers)
 
 
 def follow_matches(problem: Problem, found: Selection, workers: Workers) -> tuple[Problem, Selection]:

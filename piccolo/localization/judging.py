@@ -91,33 +91,24 @@ def promote(
     return Found(problem, promoted, fit)
 
 
-def judge_together(
-    found: Found,
-    gaussian: PoseGaussian,
-    belief: Belief,
-    means: Means,
-    min_confidence: float,
-) -> Result:
-    """Return the result of a photo whose pose was estimated from this photo and others together.
+def gather_case(found: Found, gaussian: PoseGaussian, means: Means) -> Case | None:
+    """Return the case of a photo whose pose was estimated from this photo and others together.
 
-    `gaussian` is that pose in the map; the best candidate has the same pose. `belief` is in this pose and
-    each alternative, by all photos together, without doubt about a focal length. A pose that the photo itself
-    rules out stays ruled out.
+    `gaussian` is that pose in the map; the best candidate has the same pose. A pose that the photo itself
+    rules out stays ruled out. None if the scan shows nothing there.
     """
     problem, selection, fit = found
     selection = complete(problem, selection, means.workers)
     measured = measure(problem, selection, fit, means.workers)
     if measured is None:
-        return nothing_found()
+        return None
     measured = measured._replace(
         pose=gaussian.pose,
         errors=measured.errors._replace(gaussian=gaussian),
         contradicted=contradictions(problem.scan_map, gaussian.pose, problem.prior),
     )
     standings = tuple(assess(problem.profile, selection))
-    case = Case(selection, standings, measured, fit and describe_geometry(problem, fit))
-    case = try_mirrored(problem, case, belief, means)
-    return decide_case(problem, case, belief, means, min_confidence)
+    return Case(selection, standings, measured, fit and describe_geometry(problem, fit))
 
 
 def try_mirrored(problem: Problem, case: Case, belief: Belief, means: Means) -> Case:

@@ -26,7 +26,7 @@ from ..judge.consensus import MOST_CONFLICT
 from ..judge.probability import LOCALIZED
 from ..judge.result import Result, nothing_found
 from ..localization.claimed_geometry import calibrate
-from ..localization.judging import Found, judge_together
+from ..localization.judging import Found, decide_case, gather_case, try_mirrored
 from ..localization.means import NO_TRACE, Means, Trace
 from ..photo.panorama import Panorama
 from ..poses.bundle_adjustment import (
@@ -314,7 +314,11 @@ def judge_placed(
     elsewhere, probabilities = merge_places(gaussian.pose, elsewhere, probabilities)
     belief = believe_together(shares, probabilities, within, within_others, alone)
     found = recalibrate_at(member, support, gaussian.pose, elsewhere, means.workers)
-    return judge_together(found, gaussian, belief, means, demand.min_confidence)
+    case = gather_case(found, gaussian, means)
+    if case is None:
+        return nothing_found()
+    case = try_mirrored(found.problem, case, belief, means)
+    return decide_case(found.problem, case, belief, means, demand.min_confidence)
 
 
 def merge_places(pose: Pose, elsewhere: Sequence[Pose], probabilities: Array) -> tuple[list[Pose], Array]:

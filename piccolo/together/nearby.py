@@ -30,7 +30,7 @@ from ..judge.probability import posterior
 from ..judge.result import Result
 from ..judge.selection import assess, credit_copies
 from ..localization.copies import list_reported
-from ..localization.judging import Found, judge_together
+from ..localization.judging import Found, decide_case, gather_case, try_mirrored
 from ..localization.means import Means
 from ..localization.run import find, prepare_search
 from ..problem.accuracy import Demand
@@ -199,13 +199,18 @@ def judge_nearby(
     reported, is_copy = list_reported(problem, selection, means.effort, means.workers)
     standings = credit_copies(assess(problem.profile, reported), is_copy)
     near = make_belief(posterior(standings, held.std_of_fit, problem.method)[:-1])
+    there = examine(problem, held.gaussian.pose)
+    at_pose = Found(problem, reported.take([there, *reported.alternatives]), fit)
+    case = gather_case(at_pose, held.gaussian, means)
+    if case is None:
+        return None
+    case = try_mirrored(problem, case, believe_nearby(near, prospect), means)
+    near = make_belief(posterior(standings, held.std_of_fit, problem.method, mirrored=case.mirrored)[:-1])
     odds = near.place[0] / max(near.place[-1], LEAST_NONE) / math.exp(held.candidate.log_by_others)
     local = local_share(odds, MISSED_TURNED if held.is_turned else MISSED)
     within = believe_exact(held.shares, held.exact, local)
     belief = replace(believe_nearby(near, prospect), within=within)
-    there = examine(problem, held.gaussian.pose)
-    at_pose = Found(problem, reported.take([there, *reported.alternatives]), fit)
-    result = judge_together(at_pose, held.gaussian, belief, means, demand.min_confidence)
+    result = decide_case(problem, case, belief, means, demand.min_confidence)
     return result, prospect.gain * (1.0 - near.place[-1]) / max(near.place[-1], LEAST_NONE)
 
 
