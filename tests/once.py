@@ -1,14 +1,14 @@
 """Photos that several tests localize are searched by themselves once for all tests of a module."""
 
+import pickle
+
 from piccolo.api import scan_photo
 from piccolo.together import members
 
 
 def _content(panorama):
-    """What a plain picture shows; one of another camera is like no other."""
-    if (panorama.gpano, panorama.cameras) != (None, ()):
-        return object(), None
-    return panorama.rgb.tobytes(), panorama.is_valid.tobytes()
+    """All that is known of a picture and its camera."""
+    return pickle.dumps(panorama)
 
 
 def _points(prepared):
@@ -52,7 +52,7 @@ def search_photos_once(patch):
     def search(prepared, picture, settings, *means):
         workers = means[0] if len(means) > 1 else means[0].workers
         assert len(means) > 1 or not means[0].trace.is_wanted, "the steps of each search"
-        return _points(prepared), *_content(picture), settings, workers.num_threads
+        return _points(prepared), _content(picture), settings, workers.num_threads
 
     for name in ("localize", "localize_by_paper"):
         _share(patch, scan_photo, name, search)

@@ -17,7 +17,7 @@ from piccolo.evidence.self_calibration import FreeEnd, LensEstimate, displace_bl
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.pose_gaussian import probability_of_ball
 from piccolo.geometry.sphere import compute_pixels
-from piccolo.judge.claim import Claim, PictureCorrections, marginal
+from piccolo.judge.claim import MANY, Claim, PictureCorrections, as_normal, marginal
 from piccolo.judge.result import Result
 from piccolo.judge.result_parts import SphereGeometry
 from piccolo.optimize.channel_loss import ChannelProblem
@@ -189,6 +189,15 @@ def _claim(count=2):
 def _tell(values, information):
     """What independent blocks without number tell."""
     return PictureCorrections(values, information, np.zeros((0, len(values), len(values))))
+
+
+def test_deviations_of_students_distribution_become_normal_ones_as_rare():
+    freedom, deviations = np.meshgrid(np.geomspace(1.0, MANY, 50), [0.0, *np.geomspace(1e-6, 60.0, 50)])
+    found = as_normal(deviations.ravel(), freedom.ravel()).reshape(freedom.shape)
+    chances = special.stdtr(freedom, -deviations)
+    is_common = chances > 1e-9
+    np.testing.assert_allclose(found[is_common], -special.ndtri(chances[is_common]), atol=0.021)
+    assert np.all(np.diff(found, axis=0) > 0.0)
 
 
 def test_what_few_blocks_tell_contradicts_a_claim_less():

@@ -181,7 +181,7 @@ import sys
 from piccolo.cli.localize import main
 sys.argv = ["localize.py", "--cloud", {str(prepared)!r}, "--pano", {str(image)!r}, "--quiet"]
 code = main()
-assert not {{"scipy.spatial", "scipy.sparse", "scipy.optimize"}} & set(sys.modules)
+assert not {{"scipy.spatial", "scipy.sparse", "scipy.special", "scipy.optimize"}} & set(sys.modules)
 sys.exit(code)
 """
     done = run([sys.executable, "-c", code], cwd=ROOT)

@@ -69,8 +69,12 @@ def _assert_right(results):
 
 
 @pytest.mark.process
+@pytest.mark.usefixtures("searched_once")
 def test_photos_of_one_camera(photos, tmp_path):
-    """Three say together what their focal length is; with that the fourth is looked at again beside them."""
+    """Three say together what their focal length is; with that the fourth is looked at again beside them.
+
+    Command and Python ask for the same searches, which are made once; the service makes them itself.
+    """
     cloud = str(rooms.map_path(SEED, DENSE))
     out = tmp_path / "poses.jsonl"
     near = (*place(1)[1].center_world.tolist(), 1.0)

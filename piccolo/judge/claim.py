@@ -8,7 +8,8 @@ import numpy as np
 from ..system.arrays import Array
 from .consensus import MOST_LOG
 
-LEAST_CHANCE = 1e-300  # least probability whose quantile is computed
+LEAST_SQUARE = 1e-300  # smaller ones count as this where it is divided by them
+LEAST_DEVIATION = 1e-9  # chosen: the same
 MANY = 1e12  # degrees of freedom of a deviation that is known
 
 
@@ -70,16 +71,21 @@ def count_variance_freedom(of_blocks: Array, weights: Array) -> Array:
     The formula is that of Satterthwaite (1946) for an estimate from blocks (Bell and McCaffrey, 2002).
     """
     parts = np.einsum("in,bij,jn->bn", weights, of_blocks, weights)
-    squares = np.maximum(np.square(parts).sum(axis=0), LEAST_CHANCE)
+    squares = np.maximum(np.square(parts).sum(axis=0), LEAST_SQUARE)
     freedom = np.square(parts.sum(axis=0)) / squares
     return np.asarray(np.where(freedom > 0.0, freedom, MANY))
 
 
 def as_normal(deviations: Array, freedom: Array) -> Array:
-    """Return the deviations (n,) of a normal distribution that are as rare as those of Student's."""
-    from scipy.special import ndtri, stdtr  # noqa: PLC0415  # takes 0.1 s, and is rarely needed
+    """Return the deviations (n,) of a normal distribution that are as rare as those of Student's.
 
-    return np.asarray(-ndtri(np.maximum(stdtr(freedom, -deviations), LEAST_CHANCE)))
+    By the formula of Wallace (1959), which is off by 0.02 at most up to six deviations, from one degree of
+    freedom on. SciPy's functions would take longer to import than most photos take.
+    """
+    u = np.sqrt(freedom * np.log1p(np.square(deviations) / freedom))
+    wide = 8.0 * freedom + 3.0
+    s = 0.184 * wide / (np.sqrt(freedom) * np.maximum(u, LEAST_DEVIATION))
+    return np.asarray(u * (1.0 - 2.0 / wide * np.sqrt(-np.expm1(-np.square(s)))))
 
 
 def marginal(by_picture: PictureCorrections, claim: Claim, k: int) -> tuple[float, float]:
