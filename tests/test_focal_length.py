@@ -12,8 +12,8 @@ from pictures import encoded, write
 from poses import judged
 
 import piccolo
-from piccolo.evidence import focal_length as focal
-from piccolo.evidence.examine import examine
+from piccolo.evidence import focal_length as focal, verification
+from piccolo.evidence.examine import count_agreeing, examine, examine_again
 from piccolo.evidence.lens_matches import fit_matches
 from piccolo.evidence.self_calibration import LensEstimate
 from piccolo.geometry.pose import Pose, yaw_rotation
@@ -233,6 +233,23 @@ def test_a_lens_is_fitted_again_for_as_long_as_it_settles(monkeypatch, changes, 
     found = SimpleNamespace(best=SimpleNamespace(pose=ELSEWHERE))
     claimed_geometry.calibrate(SimpleNamespace(given=None), found, rooms.WORKERS)
     assert len(refined) == num_refined
+
+
+def test_the_scan_is_not_drawn_again_for_another_calibration(monkeypatch):
+    """The photo with its new rays is matched with what was drawn for the old ones."""
+    rgb, pose = _photo(pinhole(320, 240, TRUE))
+    problem = rooms.ask(_panorama(rgb, focal_px=1.01 * TRUE), rooms.scan_map(SEED))
+    before = count_agreeing(problem, examine(problem, scan().from_world(pose)), rooms.WORKERS)
+    after = recalibrate(problem, np.array([-math.log(1.01)]), rooms.WORKERS)
+    drawn_again = count_agreeing(after, examine(after, before.pose), rooms.WORKERS)
+    monkeypatch.setattr(verification, "find_all_drawn", lambda *_: pytest.fail("drawn again"))
+    found = count_agreeing(after, examine_again(after, before, rooms.WORKERS), rooms.WORKERS)
+    assert found.score == drawn_again.score > before.score
+    assert found.num_matches == pytest.approx(drawn_again.num_matches, abs=3)
+    assert found.num_matches > before.num_matches
+    none = before.drawn.picture.keypoints.take(np.empty(0, np.int64))
+    nothing = before.drawn._replace(picture=before.drawn.picture._replace(keypoints=none))
+    assert verification.match_again(after, nothing, rooms.WORKERS) is None
 
 
 def test_other_poses_with_other_guesses_share_the_probability():

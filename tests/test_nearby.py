@@ -27,9 +27,11 @@ from piccolo.judge.by_others import (
     weigh_stray,
 )
 from piccolo.judge.candidate import NO_CANDIDATE, NO_CHOICE, Selection
+from piccolo.judge.probability import SYMMETRIC
 from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result, nothing_found
 from piccolo.judge.result_parts import Alternative
+from piccolo.localization import judging
 from piccolo.localization.judging import Found
 from piccolo.localization.means import Means
 from piccolo.scan_map.camera_positions import COARSE_SPACING
@@ -50,6 +52,8 @@ from piccolo.together.nearby import (
 )
 
 TIER = "scene"
+
+TRUST = 0.999  # in the places of others
 
 
 def test_a_place_is_as_much_likelier_as_less_of_the_scan_is_within_reach():
@@ -158,7 +162,7 @@ def test_only_what_is_within_reach_of_a_pose_is_searched():
 def _measure(poses, std=0.01):
     """Poses in the map, as sure photos tell them."""
     errors = np.diag(np.repeat([1e-4, std**2], 3))
-    return [Witness(PoseGaussian(pose, errors, np.zeros((6, 6))), 0.999) for pose in poses]
+    return [Witness(PoseGaussian(pose, errors, np.zeros((6, 6))), TRUST) for pose in poses]
 
 
 def _nearby(located, alone, min_confidence=0.9):
@@ -201,6 +205,23 @@ def test_a_photo_is_found_where_the_others_were_taken():
     assert distance < 0.1
     assert np.degrees(angle) < 2.0
     assert found.status == "localized"
+
+
+def test_a_mirrored_photo_that_fits_as_well_is_evidence_against_a_photo_near_others_too(monkeypatch):
+    """It is searched where the photo is, and counts as it does for a photo by itself."""
+    scan_map = rooms.scan_map(SEED)
+    located = [scan_map.from_world(true_places()[k]) for k in (0, 2)]
+    places = []
+    for share in (0.0, 1.0):
+
+        def find_mirrored(problem, best, *_, share=share):
+            assert len(problem.scan_map.sparse) < len(scan_map.sparse)
+            return replace(best, score=share * best.score) if share else None
+
+        monkeypatch.setattr(judging, "find_mirrored", find_mirrored)
+        places.append(sum(_nearby(located, nothing_found(), 0.05).belief.place[:-1]))
+    without, with_mirrored = (TRUST / place - 1.0 for place in places)
+    assert with_mirrored / without == pytest.approx(1.0 + 0.5 / SYMMETRIC, rel=0.01)
 
 
 def test_photos_of_one_spot_tell_where_another_was_taken():
