@@ -18,6 +18,7 @@ from piccolo.judge.candidate import Selection
 from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result, nothing_found
 from piccolo.judge.result_parts import Alternative
+from piccolo.localization import judging
 from piccolo.localization.judging import Found
 from piccolo.photo.panorama import Panorama
 from piccolo.poses import bundle_adjustment
@@ -289,6 +290,15 @@ def test_photos_are_localized_together_of_which_one_is_not_alone():
         assert distance < 4.0 * f.covariance.largest_std
         probabilities = [f.confidence, f.probability_none, *(a.probability for a in f.alternatives)]
         assert sum(probabilities) == pytest.approx(1.0)
+
+
+def test_what_is_known_of_the_mirrored_photos_is_not_searched_again(monkeypatch):
+    photos, poses = zip(*_taken(SEED, WHERE[1:]), strict=True)
+    for photo in photos:
+        found = members.find_alone(rooms.scan_map(SEED), Shot(photo, rooms.KNOWN), rooms.WORKERS, Stopwatch())
+        assert found.alone.mirrored is not None
+    monkeypatch.setattr(judging, "find_mirrored", lambda *_: pytest.fail("searched again"))
+    assert [one.status for one in _together(photos, _relative(poses))] == ["localized"] * 2
 
 
 def test_photos_of_another_room_are_not_localized():

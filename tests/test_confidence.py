@@ -75,7 +75,7 @@ def test_each_kind_of_evidence_has_a_model_of_its_own():
 )
 def test_a_photo_that_fits_as_well_mirrored_may_fit_by_chance(mirrored, factor):
     alone, none = posterior([RIGHT], SURE)
-    p = posterior([RIGHT], SURE, mirrored=mirrored)
+    p = posterior([RIGHT], SURE, mirrored=rule.Mirrored(mirrored))
     assert p[-1] / p[0] == pytest.approx(factor * none / alone, rel=1e-3)
 
 

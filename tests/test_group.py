@@ -17,6 +17,7 @@ from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add, subtract
 from piccolo.judge.belief import make_belief
 from piccolo.judge.candidate import NO_CANDIDATE, Selection
+from piccolo.judge.probability import Mirrored
 from piccolo.judge.reasons import MIRRORED, Reason
 from piccolo.judge.result import Result, nothing_found
 from piccolo.judge.selection import assess, assess_mirrored, select_mirrored
@@ -273,7 +274,7 @@ def test_a_mirrored_photo_has_less_odds_than_its_mirror_image(is_mirrored):
         problem, examine(problem, problem.scan_map.from_world(alone.best_pose)), rooms.WORKERS
     )
     seen = find_mirrored(problem, best, rooms.KNOWN.effort, rooms.WORKERS)
-    of_mirror = seen and assess_mirrored(problem.profile, best, seen)
+    of_mirror = Mirrored(seen and assess_mirrored(problem.profile, best, seen))
     result = replace(alone, standings=tuple(assess(problem.profile, Selection(best, ()))), mirrored=of_mirror)
     member = SimpleNamespace(found=SimpleNamespace(problem=problem))
     odds = mirrored.compare_mirrored(member, result)

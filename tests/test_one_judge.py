@@ -50,7 +50,8 @@ def test_what_lies_mirrored_or_contradicts_its_focal_length_is_ruled_out(
     case = Case(found, (Standing(1.0, 0.5, 60, "drawn scan"),), measured, geometry)
     belief = make_belief([probability])
     problem = replace(PROBLEM, scan_map=rooms.scan_map(1))
-    case = judging.try_mirrored(problem, case, belief, rooms.means())
+    for _ in range(2):  # what is known is not asked again
+        case = judging.try_mirrored(problem, case, belief, rooms.means())
     result = judging.decide_case(problem, case, belief, rooms.means(), 0.9)
     assert (result.status, MIRRORED in result.warnings, len(asked)) == (status, warns, num_asked)
     reasons = {Reason.MIRRORED} if warns else {Reason.SPHERE} if conflict else set()

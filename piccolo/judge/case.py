@@ -7,7 +7,7 @@ from ..geometry.pose_gaussian import PoseGaussian
 from ..photo.camera import Mount
 from ..system.arrays import Array
 from .candidate import Selection
-from .probability import Standing
+from .probability import Mirrored, Standing
 from .reasons import Contradiction
 from .result_parts import Evidence, FocalLength, SphereGeometry
 
@@ -56,5 +56,4 @@ class Case(NamedTuple):
     standings: tuple[Standing, ...]  # evidence for the best pose and each alternative
     measured: Measured
     geometry: Geometry | None = None  # None if it was not compared with the scan
-    is_mirrored: bool = False  # the photo fits the scan better mirrored
-    mirrored: Standing | None = None  # evidence for the mirrored photo; None if it explains far less
+    mirrored: Mirrored | None = None  # None if the mirrored photo was not searched

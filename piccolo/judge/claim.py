@@ -8,8 +8,7 @@ import numpy as np
 from ..system.arrays import Array
 from .consensus import MOST_LOG
 
-LEAST_SQUARE = 1e-300  # smaller ones count as this where it is divided by them
-LEAST_DEVIATION = 1e-9  # chosen: the same
+LEAST_SQUARE = 1e-200  # smaller ones count as this where it is divided by them
 MANY = 1e12  # degrees of freedom of a deviation that is known
 
 
@@ -82,10 +81,10 @@ def as_normal(deviations: Array, freedom: Array) -> Array:
     By the formula of Wallace (1959), which is off by 0.02 at most up to six deviations, from one degree of
     freedom on. SciPy's functions would take longer to import than most photos take.
     """
-    u = np.sqrt(freedom * np.log1p(np.square(deviations) / freedom))
+    squares = freedom * np.log1p(np.square(deviations) / freedom)
     wide = 8.0 * freedom + 3.0
-    s = 0.184 * wide / (np.sqrt(freedom) * np.maximum(u, LEAST_DEVIATION))
-    return np.asarray(u * (1.0 - 2.0 / wide * np.sqrt(-np.expm1(-np.square(s)))))
+    s_squared = np.square(0.184 * wide) / np.maximum(freedom * squares, LEAST_SQUARE)
+    return np.asarray(np.sqrt(squares) * (1.0 - 2.0 / wide * np.sqrt(-np.expm1(-s_squared))))
 
 
 def marginal(by_picture: PictureCorrections, claim: Claim, k: int) -> tuple[float, float]:

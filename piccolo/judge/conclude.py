@@ -33,7 +33,7 @@ def conclude(frame: MapFrame, case: Case, belief: Belief, min_confidence: float)
     geometry = case.geometry
     warnings = list(map(explain, measured.contradicted))
     reasons = [contradiction.reason for contradiction in measured.contradicted]
-    if case.is_mirrored:
+    if case.mirrored is not None and case.mirrored.fits_better:
         reasons.append(Reason.MIRRORED)
         warnings.append(MIRRORED)
     if geometry is not None and geometry.conflict > MOST_CONFLICT:

@@ -26,6 +26,13 @@ class Standing(NamedTuple):
     drawn_score: float | None = None  # score of the edges drawn at the pose, in a scan without colours
 
 
+class Mirrored(NamedTuple):
+    """Evidence for a photo that was mirrored, left for right."""
+
+    standing: Standing | None  # evidence for its best pose; None if it explains far less than the photo
+    fits_better: bool = False  # than the photo as it is
+
+
 class ChoiceModel(NamedTuple):
     """A conditional logit (McFadden, 1974) of K + 1 answers: each of the poses, and that none is right."""
 
@@ -82,7 +89,7 @@ def posterior(
     std_of_fit: float | None,
     method: Method = METHOD,
     model: ChoiceModel | None = None,
-    mirrored: Standing | None = None,
+    mirrored: Mirrored | None = None,
 ) -> Array:
     """Return the probabilities (K + 1,) that the place of each of K poses is right, and that none of them is.
 
@@ -96,8 +103,8 @@ def posterior(
     logits = [log_odds(standing, method, model) for standing in standings]
     of_none = none_features(std_of_fit)
     logits.append(float(of_none @ np.array(model.none_weights)))
-    if mirrored is not None:
-        logits[-1] += weigh_mirrored(log_odds(mirrored, method, model) - max(logits[:-1]))
+    if mirrored is not None and mirrored.standing is not None:
+        logits[-1] += weigh_mirrored(log_odds(mirrored.standing, method, model) - max(logits[:-1]))
     odds = np.exp(np.array(logits) - max(logits))
     return np.asarray(odds / odds.sum())
 

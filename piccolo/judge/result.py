@@ -20,7 +20,7 @@ from ..system.files.json_file import reading_document
 from .accuracy_hint import explain_accuracy
 from .belief import NOTHING, UNCONFIRMED, Belief, decide
 from .pose_covariance import PoseCovariance
-from .probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED, Standing
+from .probability import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED, Mirrored, Standing
 from .result_parts import Alternative, Beside, Evidence, FocalLength, Source, SphereGeometry, WalkFrame
 
 FORMAT = "piccolo-pose/13"
@@ -130,8 +130,8 @@ class Result:
     std_of_fit: float | None = field(default=None, compare=False, repr=False)
     # evidence for the pose and each alternative
     standings: tuple[Standing, ...] = field(default=(), compare=False, repr=False)
-    # evidence for the best pose of the mirrored photo
-    mirrored: Standing | None = field(default=None, compare=False, repr=False)
+    # None if the mirrored photo was not searched
+    mirrored: Mirrored | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         """Make the arrays read-only, as the JSON and the hash depend on them."""

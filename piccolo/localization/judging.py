@@ -16,7 +16,7 @@ from ..judge.belief import NOTHING, Belief, make_belief
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Case
 from ..judge.conclude import conclude
-from ..judge.probability import posterior
+from ..judge.probability import Mirrored, posterior
 from ..judge.reasons import MIRRORED, Reason
 from ..judge.result import Result, nothing_found
 from ..judge.selection import assess, assess_mirrored, credit_copies, is_mirrored
@@ -112,18 +112,19 @@ def gather_case(found: Found, gaussian: PoseGaussian, means: Means) -> Case | No
 
 
 def try_mirrored(problem: Problem, case: Case, belief: Belief, means: Means) -> Case:
-    """Return a case with the evidence for the mirrored photo, which is searched if any pose is likely."""
+    """Return a case with the evidence for the mirrored photo, which is searched if any pose is likely.
+
+    It is not searched if that evidence is known.
+    """
     best = case.found.best
     belief = doubt_geometry(case, belief)
-    if belief.sound_places[-1] >= 1.0 - problem.method.worth_asking:
+    if case.mirrored is not None or belief.sound_places[-1] >= 1.0 - problem.method.worth_asking:
         return case
     mirrored = find_mirrored(problem, best, means.effort, means.workers)
     if mirrored is None:
-        return case
-    return case._replace(
-        is_mirrored=is_mirrored(problem.method, best, mirrored),
-        mirrored=assess_mirrored(problem.profile, best, mirrored),
-    )
+        return case._replace(mirrored=Mirrored(None))
+    standing = assess_mirrored(problem.profile, best, mirrored)
+    return case._replace(mirrored=Mirrored(standing, is_mirrored(problem.method, best, mirrored)))
 
 
 def doubt_geometry(case: Case, belief: Belief) -> Belief:
@@ -149,7 +150,7 @@ def describe_case(problem: Problem, case: Case, belief: Belief) -> Step:
         "standings": [standing._asdict() for standing in case.standings],
         "std_of_fit": case.measured.errors.std_of_fit,
         "conflict": case.geometry.conflict if case.geometry else 0.0,
-        "is_mirrored": case.is_mirrored,
-        "mirrored": case.mirrored and case.mirrored._asdict(),
+        "is_mirrored": case.mirrored is not None and case.mirrored.fits_better,
+        "mirrored": case.mirrored and case.mirrored.standing and case.mirrored.standing._asdict(),
         **describe_selection(problem, case.found),
     }

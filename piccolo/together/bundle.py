@@ -317,6 +317,8 @@ def judge_placed(
     case = gather_case(found, gaussian, means)
     if case is None:
         return nothing_found()
+    if member.is_best(gaussian.pose):
+        case = case._replace(mirrored=member.alone.mirrored)
     case = try_mirrored(found.problem, case, belief, means)
     return decide_case(found.problem, case, belief, means, demand.min_confidence)
 

@@ -49,4 +49,5 @@ def compare_mirrored(member: Member, result: Result) -> float:
     method = member.found.problem.method
     own = max(result.standings, key=lambda standing: log_odds(standing, method))
     less = own._replace(ratio=method.decoy_ratio * own.ratio, score=method.decoy_ratio * own.score)
-    return log_odds(result.mirrored or less, method) - log_odds(own, method)
+    mirrored = result.mirrored and result.mirrored.standing
+    return log_odds(mirrored or less, method) - log_odds(own, method)
