@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import rooms
 
+from piccolo.cloud import surfaces
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.surfaces import (
     FULL_SHARE,
@@ -47,6 +48,15 @@ def test_a_part_of_the_noise_alike_in_all_directions(noise):
     deviations, _ = _deviations(points)
     assert deviations.min() > 0.6 * NOISE_SHARE * noise
     assert deviations.max() < 1.4 * NOISE_SHARE * noise
+
+
+def test_last_digits_are_not_those_of_a_blas_library(monkeypatch):
+    octree = build_octree(rooms.voxels(_room(100_000)))
+    expected = surface_variance(octree)
+    fit = surfaces.fit_tensor
+    monkeypatch.setattr(surfaces, "fit_tensor", lambda *cells: fit(*cells) * (1.0 + 1e-15))
+    np.testing.assert_array_equal(surface_variance(octree), expected)
+    assert expected.max() > 0.0
 
 
 @pytest.mark.parametrize("gap", [0.03, 0.05])

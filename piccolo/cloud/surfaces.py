@@ -152,7 +152,8 @@ def surface_variance(octree: Octree) -> Array:
             continue
         cells = residual_moments(octree, levels_up, least_leaves)
         if len(cells[1]) >= MIN_CELLS:
-            return fit_tensor(*cells)
+            tensor = fit_tensor(*cells)
+            return tensor.astype(np.float32).astype(np.float64)  # its last digits depend on the BLAS library
     return np.zeros((3, 3))
 
 
