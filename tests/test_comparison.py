@@ -22,6 +22,7 @@ from piccolo.geometry.sphere import (
 )
 from piccolo.judge.candidate import CONTRADICTS, Comparison
 from piccolo.judge.selection import is_mirrored
+from piccolo.localization import mirror
 from piccolo.localization.beam import Ends
 from piccolo.localization.mirror import find_mirrored, is_found_again, list_mirrored
 from piccolo.localization.search import Starts
@@ -224,6 +225,24 @@ def test_a_photo_that_was_turned_over_is_told(fov_deg):
     assert find_mirrored(turned_over, few, rooms.AUTO.effort, rooms.WORKERS) is not None
     for problem, best in ((turned_over, plain), (turned_over.by_views(), doubtful)):
         assert find_mirrored(problem, best, rooms.AUTO.effort, rooms.WORKERS) is None
+
+
+@pytest.mark.parametrize(("num_matches", "is_searched"), [(None, True), (11, True), (12, False)])
+def test_a_mirrored_photo_is_searched_at_any_level_tilt_if_few_matches_agree(
+    monkeypatch, num_matches, is_searched
+):
+    """Its wrong pose is tilted by half a radian, and its mirror image at that tilt is found nowhere."""
+    outside = mask_outside_field(WIDTH, 90.0, 0.5)
+    turned_over = _problem(rooms.query(1).rgb[:, ::-1].copy(), outside[:, ::-1].copy())
+    true_pose = _clean()[1]
+    wrong = Pose(exp_so3(np.array([0.0, 0.5, 0.0])) @ true_pose.R_cam_from_world, true_pose.center_world)
+    best = replace(make_candidate(0.0, 0.69, num_matches), pose=wrong)
+    monkeypatch.setattr(mirror, "search_mirrored", lambda *_: [])
+    found = find_mirrored(turned_over, best, rooms.AUTO.effort, rooms.WORKERS)
+    assert (found is not None) == is_searched
+    if found is not None:
+        rooms.assert_near(found.pose, true_pose, 0.05, 2.0)
+        assert is_mirrored(METHOD, best, found)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
-from made_up import PROBLEM, make_candidate
+from made_up import PROBLEM, make_candidate, make_selection, place
 
 from piccolo.evidence.focal_length import FocalFit
 from piccolo.judge.belief import make_belief
@@ -38,7 +38,7 @@ def _find(monkeypatch, results, cameras):
     given = dict(enumerate(results))
     asked = []
 
-    def find_alone(scan_map, shot, workers, watch):
+    def find_alone(scan_map, shot, workers, watch, before):
         number = len(asked)
         asked.append(shot)
         found = Found(replace(PROBLEM), Selection(make_candidate(0.0, 0.5), ()), FIT)
@@ -69,6 +69,39 @@ def test_photos_of_another_camera_say_nothing_of_it(monkeypatch):
     alone, _, asked = _find(monkeypatch, [SURE, SURE, SURE, REFUSED], ["a", "a", "a", "bb"])
     assert alone[-1] is REFUSED
     assert [shot.is_confirmed for shot in asked] == [True, True, True, False]
+
+
+@pytest.mark.parametrize(("focal", "is_searched"), [(505.0, False), (480.0, False), (530.0, True)])
+def test_a_photo_is_searched_again_only_with_another_focal_length(monkeypatch, focal, is_searched):
+    """With about the same one, the poses that were found are refined."""
+    poses = make_selection(make_candidate(0.0, 0.5), make_candidate(2.0, 0.4))
+    before = Member(Found(_with_focal(500.0), poses, None), SURE)
+    done = []
+
+    def search(problem, scan_map, means):
+        done.append("searched")
+        return before.found
+
+    def refine_known(problem, poses, means):
+        done.append([place(pose) for pose in poses])
+        return before.found
+
+    monkeypatch.setattr(Found, "forget", lambda self: self)
+    monkeypatch.setattr(members, "prepare_search", lambda *_: PROBLEM)
+    monkeypatch.setattr(members, "find", search)
+    monkeypatch.setattr(members, "refine_known", refine_known)
+    monkeypatch.setattr(members, "judge", lambda *_, **__: SURE)
+    shot = Shot(_with_focal(focal).given, CoarseToFineSettings())
+    found = members.find_alone(None, shot, Workers(1), Stopwatch(), before)
+    assert done == (["searched"] if is_searched else [[0.0, 2.0]])
+    assert found == before
+
+
+def _with_focal(focal):
+    """A problem of a photo with a focal length."""
+    camera = SimpleNamespace(focal=(focal, focal))
+    given = SimpleNamespace(focal_prior=None, cameras=[SimpleNamespace(camera=camera)])
+    return replace(PROBLEM, given=given)
 
 
 def test_other_reasons_against_a_photo_stay(monkeypatch):

@@ -4,6 +4,7 @@ The scan shows a mirror image nowhere, so that it fits by chance alone. If it fi
 itself, that one may fit by chance too: it is a decoy (Elias and Gygi, 2007).
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,15 +30,31 @@ def find_mirrored(problem: Problem, best: Candidate, effort: Effort, workers: Wo
     """Return the best pose of the mirrored photo; None if it explains far less than the photo's own best.
 
     The mirrored photo is not searched if the photo is explained well and has many matches, if the scan has no
-    colours, and if the pose is by whole views alone, as the first look has then compared both.
+    colours, and if the pose is by whole views alone, as the first look has then compared both. One of a part
+    of the sphere with few matches is searched as the photo was too, at any tilt of a camera held about level:
+    a wrong pose may have another tilt than the mirrored photo at its right one.
     """
-    if is_explained(problem.method, best) or not problem.profile.uses_matches:
+    method = problem.method
+    if is_explained(method, best) or not problem.profile.uses_matches:
         return None
     mirrored = problem.mirror()
     found = search_mirrored(problem, mirrored, best.pose, effort, workers)
-    if not found or found[0].score < problem.method.decoy_ratio * best.score:
-        return None
-    return count_agreeing(mirrored, found[0], workers)
+    is_doubtful = problem.profile.is_narrow and (best.num_matches or 0) < method.sure_matches
+    if is_doubtful and not is_decoy(method, found, best):
+        found = search_level(mirrored, effort, workers)
+    return count_agreeing(mirrored, found[0], workers) if is_decoy(method, found, best) else None
+
+
+def is_decoy(method: Method, found: Sequence[Candidate], best: Candidate) -> bool:
+    """Return True if the best pose found for the mirrored photo explains nearly as much as the photo's own."""
+    return bool(found) and found[0].score >= method.decoy_ratio * best.score
+
+
+def search_level(mirrored: Problem, effort: Effort, workers: Workers) -> list[Candidate]:
+    """Return poses of a mirrored photo at its known tilt, else at those of a camera held about level."""
+    tilts = "known" if mirrored.photo.has_tilt else mirrored.profile.default_tilt
+    starts = search_poses(mirrored, tilts, effort, workers)
+    return refine_starts(mirrored, starts, mirrored.profile.beam, workers)
 
 
 def is_explained(method: Method, best: Candidate) -> bool:

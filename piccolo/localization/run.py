@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
+from ..evidence.examine import examine_each
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..judge.alternatives import MAX_ALTERNATIVES
@@ -24,7 +25,7 @@ from ..problem.problem import Problem, prepare_problem
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
 from ..system.jobs.threads import Stopwatch, one_blas_thread
-from .attempts import Attempt, plan_attempts, search_beyond_prior
+from .attempts import Attempt, add_verified, plan_attempts, search_beyond_prior
 from .claimed_geometry import calibrate, calibrate_sphere
 from .judging import Found, judge
 from .last_descent import refine_best
@@ -135,6 +136,13 @@ def find_by_edges(problem: Problem, scan_map: ScanMap, means: Means) -> Found:
         return best
     in_any_heading = find(replace(level, rotations=None), scan_map, means)
     return max([best, in_any_heading], key=lambda one: one.selection.best.score)
+
+
+def refine_known(problem: Problem, poses: Sequence[Pose], means: Means) -> Found:
+    """Refine poses in the map to the end that are known without a search."""
+    workers = means.workers
+    candidates = add_verified(problem, examine_each(problem, poses, workers), workers)
+    return fit_camera(problem, refine_best(problem, candidates, workers), means)
 
 
 def fit_camera(problem: Problem, found: Selection, means: Means) -> Found:

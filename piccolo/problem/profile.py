@@ -137,6 +137,10 @@ class Profile:
         """Return the profile that judges poses by whole views alone; by shape it is always so."""
         return replace(self, evidence="views", is_narrow=False) if self.uses_matches else self
 
+    def near_others(self) -> "Profile":
+        """Return the profile for a search near others: of few places, few look like a part of the sphere."""
+        return replace(self, thins_starts=True, beam=WHOLE_BEAM)
+
 
 def of_part(whole: Profile) -> Profile:
     """Return the profile of photos that show a part of the sphere, from that of whole ones."""

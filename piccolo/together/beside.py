@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 from ..evidence.contradictions import contradictions
 from ..evidence.covariance import split_errors
-from ..evidence.examine import examine
 from ..evidence.focal_length import FocalFit
 from ..evidence.verification import match_beside, match_covariance, place_keypoints
 from ..geometry.nearness import CONFIRMED
@@ -24,11 +23,9 @@ from ..judge.pose_covariance import PoseCovariance
 from ..judge.result import Result, nothing_found
 from ..local_features.hypotheses import exact_pose, propose_poses
 from ..local_features.matching import Located, Matches
-from ..localization.attempts import add_verified
 from ..localization.judging import Found, judge
-from ..localization.last_descent import refine_best
 from ..localization.means import Means
-from ..localization.run import fit_camera
+from ..localization.run import refine_known
 from ..photo.panorama import Panorama
 from ..problem.method import Method
 from ..problem.prior import apply_prior
@@ -108,8 +105,7 @@ def localize_beside(
     with watch.stage("refine"):
         problem = replace(problem, beside=tuple(other.matches for other in found))
         poses = [*known, *(other.pose for other in found)]
-        candidates = add_verified(problem, [examine(problem, pose) for pose in poses], workers)
-        ended = fit_camera(problem, refine_best(problem, candidates, workers), means)
+        ended = refine_known(problem, poses, means)
         if isinstance(ended.fit, FocalFit):  # the photo beside confirms the pose
             ended = ended._replace(fit=ended.fit._replace(of_picture=None))
         judged = judge(ended, means, settings.demand)

@@ -20,6 +20,7 @@ from ..localization.run import (
     find_by_edges,
     list_guessed,
     prepare_search,
+    refine_known,
 )
 from ..photo.panorama import Panorama
 from ..problem.settings import CoarseToFineSettings
@@ -43,6 +44,11 @@ class Member:
         has_conflict = fit is not None and fit.conflict > MOST_CONFLICT
         return has_conflict and prior is not None and prior.is_measured
 
+    def has_focal(self, panorama: Panorama) -> bool:
+        """Return True if it was found with about the focal length of a panorama."""
+        used = self.found.problem.given.cameras[0].camera.focal[0]
+        return abs(math.log(panorama.cameras[0].camera.focal[0] / used)) < ABOUT_SAME_FOCAL
+
     def is_best(self, pose: Pose) -> bool:
         """Return True if a pose is at the place of the best that was found alone."""
         return ONE_IN_BUNDLE.holds(pose, self.found.selection.best.pose)
@@ -63,6 +69,7 @@ class Grouped(NamedTuple):
     others: tuple[int, ...]  # numbers of these photos; empty if it was localized alone
 
 
+ABOUT_SAME_FOCAL = 0.05  # chosen: difference of logarithms; a search finds the same poses with both
 MEMORY_OF_PHOTO = 4e7  # [byte] that a photo keeps while others are localized; 23e6 of 1024 x 768 px measured
 
 
@@ -94,8 +101,8 @@ def find_members(
 ) -> tuple[list[Result], dict[int, Member], list[Shot]]:
     """Find each of several photos by itself.
 
-    Photos that are not sure are searched again with the focal length that sure photos of the same camera
-    have; if these are enough, no single photo contradicts what is given of the camera. Returns the result of
+    Photos that are not sure are found again with the focal length that sure photos of the same camera have;
+    if these are enough, no single photo contradicts what is given of the camera. Returns the result of
     each photo alone, the photos that could be searched by their numbers, and all photos as they were searched
     last.
     """
@@ -106,7 +113,7 @@ def find_members(
     def find_each(numbered: Iterable[tuple[int, Shot]]) -> None:
         for k, shot in numbered:
             asked[k] = shot
-            member = find_alone(scan_map, shot, workers, watch)
+            member = find_alone(scan_map, shot, workers, watch, members.get(k))
             if member is None:
                 alone[k] = explain_nothing(scan_map, shot.panorama, shot.settings.prior)
             else:
@@ -136,8 +143,13 @@ def confirm_camera(member: Member, shot: Shot, means: Means) -> Member:
     return Member(found.forget(), judged)
 
 
-def find_alone(scan_map: ScanMap, shot: Shot, workers: Workers, watch: Stopwatch) -> Member | None:
-    """Find a photo by itself, with the best of several guessed focal lengths; None if nothing is searched."""
+def find_alone(
+    scan_map: ScanMap, shot: Shot, workers: Workers, watch: Stopwatch, before: Member | None = None
+) -> Member | None:
+    """Find a photo by itself, with the best of several guessed focal lengths; None if nothing is searched.
+
+    If it was found `before` with about the same focal length, its poses are refined with this one.
+    """
     settings = shot.settings
     means = Means(settings.effort, workers, watch, shot.trace)
     found: list[Member] = []
@@ -145,8 +157,13 @@ def find_alone(scan_map: ScanMap, shot: Shot, workers: Workers, watch: Stopwatch
         problem = prepare_search(scan_map, photo, settings, watch)
         if problem is None:
             return None
-        search = find_by_edges if problem.profile.follows_walls else find
-        ended = search(problem, scan_map, means)
+        if before is not None and before.has_focal(photo):
+            known = [one.pose for one in before.found.selection.candidates]
+            with watch.stage("refine"):
+                ended = refine_known(problem, known, means)
+        else:
+            search = find_by_edges if problem.profile.follows_walls else find
+            ended = search(problem, scan_map, means)
         judged = judge(ended, means, settings.demand, may_promote=False)
         found.append(Member(ended.forget(), judged))
         if judged.status == LOCALIZED:
