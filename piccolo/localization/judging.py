@@ -120,11 +120,16 @@ def try_mirrored(problem: Problem, case: Case, belief: Belief, means: Means) -> 
     belief = doubt_geometry(case, belief)
     if case.mirrored is not None or belief.sound_places[-1] >= 1.0 - problem.method.worth_asking:
         return case
+    return case._replace(mirrored=gather_mirrored(problem, best, means))
+
+
+def gather_mirrored(problem: Problem, best: Candidate, means: Means) -> Mirrored:
+    """Search the mirrored photo, and return the evidence for it."""
     mirrored = find_mirrored(problem, best, means.effort, means.workers)
     if mirrored is None:
-        return case._replace(mirrored=Mirrored(None))
+        return Mirrored(None)
     standing = assess_mirrored(problem.profile, best, mirrored)
-    return case._replace(mirrored=Mirrored(standing, is_mirrored(problem.method, best, mirrored)))
+    return Mirrored(standing, is_mirrored(problem.method, best, mirrored))
 
 
 def doubt_geometry(case: Case, belief: Belief) -> Belief:

@@ -46,7 +46,7 @@ def find_mirrored(problem: Problem, best: Candidate, effort: Effort, workers: Wo
 
 
 def is_decoy(method: Method, found: Sequence[Candidate], best: Candidate) -> bool:
-    """Return True if the best pose found for the mirrored photo explains nearly as much as the photo's own."""
+    """Return True if the best pose of the mirrored photo explains nearly as much as the photo's own."""
     return bool(found) and found[0].score >= method.decoy_ratio * best.score
 
 

@@ -10,9 +10,12 @@ from typing import NamedTuple
 from ..evidence.covariance import estimate_pose_errors
 from ..evidence.examine import complete, examine
 from ..judge.candidate import Selection
+from ..judge.probability import LOCALIZED
+from ..judge.reasons import Reason
 from ..judge.result import Result
+from ..judge.selection import assess
 from ..local_features.keypoints import Keypoints
-from ..localization.judging import Found
+from ..localization.judging import Found, gather_mirrored
 from ..localization.means import Means
 from ..localization.run import prepare_search
 from ..photo.panorama import Panorama
@@ -67,7 +70,7 @@ def localize_among(
         else:
             members[k] = member
     with watch.stage("refine"):
-        found = localize_linked(members, means, settings.demand)
+        found = localize_linked(compare_sure(members, means), means, settings.demand)
     return {k: one for k, one in found.items() if photos[k].is_open and one.others}
 
 
@@ -105,6 +108,22 @@ def recall_found(scan_map: ScanMap, photo: Known, workers: Workers, watch: Stopw
         gaussian = recall_gaussian(problem, best.pose, result.covariance) or errors.gaussian
         alone = replace(result, gaussian=gaussian, std_of_fit=errors.std_of_fit)
         return Member(Found(problem, found, None).forget(), alone)
+
+
+def compare_sure(members: Mapping[int, Member], means: Means) -> dict[int, Member]:
+    """Return photos, the sure ones with the evidence that results do not keep, if one was mirrored."""
+    if not any(Reason.MIRRORED in one.alone.belief.ruled_out for one in members.values()):
+        return dict(members)
+    lacking = [k for k, one in members.items() if one.alone.status == LOCALIZED and not one.alone.mirrored]
+    return {**members, **{k: compare_mirror(members[k], means) for k in lacking}}
+
+
+def compare_mirror(member: Member, means: Means) -> Member:
+    """Return a photo with the evidence for its poses, and for the mirrored photo."""
+    problem, selection, _ = member.found
+    standings = tuple(assess(problem.profile, selection))
+    mirrored = gather_mirrored(problem, selection.best, means)
+    return replace(member, alone=replace(member.alone, standings=standings, mirrored=mirrored))
 
 
 def search_again(scan_map: ScanMap, photo: Known, means: Means) -> Member | None:
