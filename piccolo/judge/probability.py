@@ -48,6 +48,7 @@ MOST_RATIO = 1.2
 # Of 33 crops of a house and a hospital at their right poses three fit nearly as well mirrored, where the
 # building is symmetric; of 16 wrong poses eleven did.
 SYMMETRIC = 0.08  # share of right poses whose photo fits as well mirrored
+TURNED_OVER = 0.02  # chosen: share of photos that were mirrored
 CONTRADICTED_ODDS = 0.01  # odds that the user's prior knowledge is wrong
 # By tools/benchmark.py calibration. Each feature counts in one direction only.
 FEATURES = ("log of the ratio", "log of the score", "log of the matches, or of the drawn score")
@@ -116,6 +117,16 @@ def weigh_mirrored(difference: float) -> float:
     tells nothing: two rooms may look alike as they are.
     """
     return math.log1p(1.0 / (SYMMETRIC * (1.0 + math.exp(-difference))))
+
+
+def share_unmirrored(
+    standings: Sequence[Standing], mirrored: Mirrored | None, method: Method = METHOD
+) -> float:
+    """Return the probability that a photo that is right as it is, or mirrored, is so as it is."""
+    if mirrored is None or mirrored.standing is None:
+        return 1.0
+    own = max(log_odds(standing, method) for standing in standings)
+    return 1.0 / (1.0 + TURNED_OVER * math.exp(log_odds(mirrored.standing, method) - own))
 
 
 def classify(probabilities: Array, min_confidence: float) -> str:

@@ -16,7 +16,7 @@ from ..judge.belief import NOTHING, Belief, make_belief
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Case
 from ..judge.conclude import conclude
-from ..judge.probability import Mirrored, posterior
+from ..judge.probability import Mirrored, posterior, share_unmirrored
 from ..judge.reasons import MIRRORED, Reason
 from ..judge.result import Result, nothing_found
 from ..judge.selection import assess, assess_mirrored, credit_copies, is_mirrored
@@ -75,7 +75,10 @@ def judge(found: Found, means: Means, demand: Demand, may_promote: bool = True) 
     case = Case(reported, tuple(standings), measured, fit and describe_geometry(problem, fit))
     case = try_mirrored(problem, case, belief, means)
     places = posterior(standings, std_of_fit, problem.method, mirrored=case.mirrored)[:-1]
-    return decide_case(problem, case, make_belief(places, belief.within), means, demand.min_confidence)
+    belief = make_belief(places, belief.within).scale(
+        share_unmirrored(standings, case.mirrored, problem.method)
+    )
+    return decide_case(problem, case, belief, means, demand.min_confidence)
 
 
 def promote(
