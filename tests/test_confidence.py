@@ -79,6 +79,18 @@ def test_a_photo_that_fits_as_well_mirrored_may_fit_by_chance(mirrored, factor):
     assert p[-1] / p[0] == pytest.approx(factor * none / alone, rel=1e-3)
 
 
+def test_no_pose_is_surer_than_that_the_photo_was_not_mirrored():
+    share = rule.share_unmirrored
+    assert share([RIGHT], None) == share([RIGHT], rule.Mirrored(None)) == 1.0
+    assert share([RIGHT], rule.Mirrored(ELSEWHERE._replace(score=0.001))) > 0.999
+    alike = rule.Mirrored(RIGHT)
+    assert share([RIGHT], alike) == pytest.approx(1.0 / (1.0 + rule.TURNED_OVER))
+    assert share([WRONG, RIGHT], alike) == share([RIGHT], alike), "against the pose that fits best"
+    twice = rule.Mirrored(RIGHT._replace(num_matches=2 * RIGHT.num_matches + rule.METHOD.noise_matches))
+    weight = rule.MODELS[RIGHT.evidence].weights[2]
+    assert share([RIGHT], twice) == pytest.approx(1.0 / (1.0 + rule.TURNED_OVER * 2.0**weight))
+
+
 @pytest.mark.parametrize("copies", [2, 3, 5])
 def test_copies_share_the_probability_alike_and_none_of_them_is_localized(copies):
     p = posterior([RIGHT] * copies, SURE)
