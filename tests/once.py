@@ -36,9 +36,11 @@ def search_alone_once(patch):
     A search whose steps are noted is not shared.
     """
 
-    def alone(scan_map, shot, workers, _):
+    def alone(scan_map, shot, workers, _, before=None):
         traced = object() if shot.trace.is_wanted else None
-        return _points(scan_map), _content(shot.panorama), shot.settings, workers.num_threads, traced
+        known = before and tuple(one.pose.key for one in before.found.selection.candidates)
+        photo = (_content(shot.panorama), shot.settings, known)
+        return _points(scan_map), photo, workers.num_threads, traced
 
     _share(patch, members, "find_alone", alone)
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import rooms
 from groups import SEED, one_taken, true_places
+from made_up import PROBLEM
 
 from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian
@@ -27,7 +28,7 @@ from piccolo.judge.by_others import (
     weigh_stray,
 )
 from piccolo.judge.candidate import NO_CANDIDATE, NO_CHOICE, Selection
-from piccolo.judge.probability import SYMMETRIC, TURNED_OVER
+from piccolo.judge.probability import SYMMETRIC, TURNED_OVER, Mirrored, Standing
 from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result, nothing_found
 from piccolo.judge.result_parts import Alternative
@@ -49,6 +50,7 @@ from piccolo.together.nearby import (
     keep_near,
     localize_nearby,
     narrow_around,
+    recall_mirrored,
     search_nearby,
 )
 
@@ -228,6 +230,19 @@ def test_a_mirrored_photo_that_fits_as_well_is_evidence_against_a_photo_near_oth
         TRUST * s / place - 1.0 for s, place in zip((1.0, unmirrored), places, strict=True)
     )
     assert with_mirrored / without == pytest.approx(1.0 + 0.5 / SYMMETRIC, rel=0.01)
+
+
+def test_a_mirrored_photo_need_not_have_been_taken_near_the_others():
+    """What is known of it by the whole scan counts near others, if the photo was found at the same place."""
+    scan_map = rooms.scan_map(SEED)
+    pose = scan_map.from_world(true_places()[0])
+    found = Found(replace(PROBLEM, scan_map=scan_map), NO_CHOICE, None)
+    known = Mirrored(Standing(1.1, 0.6, 20, "drawn scan"))
+    alone = Result(best_pose=scan_map.to_world(pose), mirrored=known)
+    assert recall_mirrored(found, alone, pose) is known
+    beside = replace(pose, center_world=pose.center_world + np.array([0.6, 0.0, 0.0]))
+    assert recall_mirrored(found, alone, beside) is None
+    assert recall_mirrored(found, nothing_found(), pose) is None
 
 
 def test_photos_of_one_spot_tell_where_another_was_taken():

@@ -57,3 +57,14 @@ class Case(NamedTuple):
     measured: Measured
     geometry: Geometry | None = None  # None if it was not compared with the scan
     mirrored: Mirrored | None = None  # None if the mirrored photo was not searched
+
+    @property
+    def is_mirrored(self) -> bool:
+        """True if the mirrored photo fits better."""
+        return self.mirrored is not None and self.mirrored.fits_better
+
+    @property
+    def fits_as_mirrored(self) -> bool:
+        """True if the mirrored photo explains as much, though it does not fit better."""
+        standing = self.mirrored and self.mirrored.standing
+        return standing is not None and standing.ratio >= 1.0 and not self.is_mirrored

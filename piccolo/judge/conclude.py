@@ -10,7 +10,7 @@ from .case import Case, Geometry
 from .consensus import MOST_CONFLICT, Opinion
 from .pose_covariance import describe_errors
 from .probability import LOCALIZED
-from .reasons import MIRRORED, Reason, explain
+from .reasons import FITS_MIRRORED, MIRRORED, Reason, explain
 from .result import Result
 from .result_parts import Alternative, FocalLength
 
@@ -33,7 +33,7 @@ def conclude(frame: MapFrame, case: Case, belief: Belief, min_confidence: float)
     geometry = case.geometry
     warnings = list(map(explain, measured.contradicted))
     reasons = [contradiction.reason for contradiction in measured.contradicted]
-    if case.mirrored is not None and case.mirrored.fits_better:
+    if case.is_mirrored:
         reasons.append(Reason.MIRRORED)
         warnings.append(MIRRORED)
     if geometry is not None and geometry.conflict > MOST_CONFLICT:
@@ -60,6 +60,8 @@ def conclude(frame: MapFrame, case: Case, belief: Belief, min_confidence: float)
     )
     decided = described.take_belief(belief.rule_out(*reasons), min_confidence)
     doubts = () if geometry is None else explain_doubts(geometry, decided.status)
+    if case.fits_as_mirrored and decided.status != LOCALIZED:
+        doubts = (FITS_MIRRORED, *doubts)
     return replace(decided, warnings=(*warnings, *doubts))
 
 

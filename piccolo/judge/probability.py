@@ -122,11 +122,16 @@ def weigh_mirrored(difference: float) -> float:
 def share_unmirrored(
     standings: Sequence[Standing], mirrored: Mirrored | None, method: Method = METHOD
 ) -> float:
-    """Return the probability that a photo that is right as it is, or mirrored, is so as it is."""
+    """Return the probability that a photo that is right as it is, or mirrored, is so as it is.
+
+    By the photo alone: whatever is known of the place holds for both.
+    """
     if mirrored is None or mirrored.standing is None:
         return 1.0
-    own = max(log_odds(standing, method) for standing in standings)
-    return 1.0 / (1.0 + TURNED_OVER * math.exp(log_odds(mirrored.standing, method) - own))
+    of_mirrored, *own = (
+        log_odds(one._replace(log_prior=0.0), method) for one in (mirrored.standing, *standings)
+    )
+    return 1.0 / (1.0 + TURNED_OVER * math.exp(of_mirrored - max(own)))
 
 
 def classify(probabilities: Array, min_confidence: float) -> str:

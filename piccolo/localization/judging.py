@@ -158,7 +158,7 @@ def describe_case(problem: Problem, case: Case, belief: Belief) -> Step:
         "standings": [standing._asdict() for standing in case.standings],
         "std_of_fit": case.measured.errors.std_of_fit,
         "conflict": case.geometry.conflict if case.geometry else 0.0,
-        "is_mirrored": case.mirrored is not None and case.mirrored.fits_better,
+        "is_mirrored": case.is_mirrored,
         "mirrored": case.mirrored and case.mirrored.standing and case.mirrored.standing._asdict(),
         **describe_selection(problem, case.found),
     }

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..evidence.examine import examine
+from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
 from ..judge.belief import make_belief
@@ -26,7 +27,7 @@ from ..judge.by_others import (
     local_share,
     weigh_stray,
 )
-from ..judge.probability import posterior, share_unmirrored
+from ..judge.probability import Mirrored, posterior, share_unmirrored
 from ..judge.result import Result
 from ..judge.selection import assess, credit_copies
 from ..localization.copies import list_reported
@@ -118,7 +119,7 @@ def localize_nearby(
     None if there is no candidate place, or if it is not likelier than not, or the photo no surer than alone.
     """
     elsewhere = compute_odds_elsewhere(scan_map, alone, take_poses(located))
-    found = look_nearby(searched, elsewhere, located, means, demand)
+    found = look_nearby(searched, alone, elsewhere, located, means, demand)
     if found is None or found.result.belief.best_place <= EVEN_ODDS:
         return None
     return found if found.result.confidence > alone.confidence and not found.fits_mirrored(means) else None
@@ -140,7 +141,7 @@ def doubt_stray(
     demand = shot.settings.demand
     elsewhere = compute_odds_elsewhere(scan_map, alone, poses)
     searched = search_nearby(scan_map, shot, poses, means)
-    found = searched and look_nearby(searched, elsewhere, located, means, demand)
+    found = searched and look_nearby(searched, alone, elsewhere, located, means, demand)
     odds = 0.0 if found is None else found.odds
     near, far = weigh_stray(odds, elsewhere, len(located), num_strays)
     if found is not None and near > far and not found.fits_mirrored(means):
@@ -151,7 +152,12 @@ def doubt_stray(
 
 
 def look_nearby(
-    searched: Searched, elsewhere: float, located: Sequence[Witness], means: Means, demand: Demand
+    searched: Searched,
+    alone: Result,
+    elsewhere: float,
+    located: Sequence[Witness],
+    means: Means,
+    demand: Demand,
 ) -> FoundNearby | None:
     """Judge a photo that was searched within reach of others; None if there is no candidate place.
 
@@ -163,7 +169,8 @@ def look_nearby(
     nearby = Nearby(find_spots([one.gaussian for one in located]), num_near, demand.accuracy)
     found, held = hold_at_spots(keep_near(searched.found, take_poses(located)), nearby, means)
     prospect = Prospect(elsewhere, searched.gain, find_trust(located, held.candidate.pose))
-    judged = judge_nearby(found, held, prospect, means, demand)
+    mirrored = recall_mirrored(found, alone, held.candidate.pose)
+    judged = judge_nearby(found, held, prospect, mirrored, means, demand)
     return None if judged is None else FoundNearby(*judged, found, held, nearby)
 
 
@@ -186,12 +193,29 @@ def take_poses(located: Sequence[Witness]) -> list[Pose]:
     return [one.gaussian.pose for one in located]
 
 
+def recall_mirrored(found: Found, alone: Result, pose: Pose) -> Mirrored | None:
+    """Return the evidence for the mirrored photo by the photo alone, if that was found at the same place.
+
+    The mirrored photo was searched in the whole scan then; it need not have been taken near the others.
+    """
+    if alone.best_pose is None:
+        return None
+    is_same = ONE_IN_BUNDLE.holds(found.problem.scan_map.from_world(alone.best_pose), pose)
+    return alone.mirrored if is_same else None
+
+
 def judge_nearby(
-    found: Found, held: Held, prospect: Prospect, means: Means, demand: Demand
+    found: Found,
+    held: Held,
+    prospect: Prospect,
+    mirrored: Mirrored | None,
+    means: Means,
+    demand: Demand,
 ) -> tuple[Result, float] | None:
     """Return the result of a photo for the best of its poses near others; None if nothing fixes it.
 
-    Return also the odds of its places there, if it was taken there.
+    `mirrored` is the evidence for the mirrored photo, if that is known. Return also the odds of the photo's
+    places there, if it was taken there.
     """
     if held.gaussian is None:
         return None
@@ -204,6 +228,7 @@ def judge_nearby(
     case = gather_case(at_pose, held.gaussian, means)
     if case is None:
         return None
+    case = case._replace(mirrored=mirrored)
     case = try_mirrored(problem, case, believe_nearby(near, prospect), means)
     near = make_belief(posterior(standings, held.std_of_fit, problem.method, mirrored=case.mirrored)[:-1])
     odds = near.place[0] / max(near.place[-1], LEAST_NONE) / math.exp(held.candidate.log_by_others)
