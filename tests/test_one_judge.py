@@ -61,9 +61,15 @@ def test_what_lies_mirrored_or_contradicts_its_focal_length_is_ruled_out(
 
 @pytest.mark.parametrize(
     ("score", "is_known", "place", "is_told"),
-    [(0.5, True, 0.85, True), (0.49, True, 0.85, False), (0.5, True, 0.95, False), (0.5, False, 0.85, False)],
+    [
+        (0.5, True, 0.85, True),
+        (0.49, True, 0.85, False),
+        (0.5, True, 0.95, False),
+        (0.5, True, 0.45, False),
+        (0.5, False, 0.85, False),
+    ],
 )
-def test_a_photo_that_fits_as_well_mirrored_is_told_so_unless_it_is_sure(score, is_known, place, is_told):
+def test_a_photo_that_fits_as_well_mirrored_is_told_so_if_it_is_nearly_sure(score, is_known, place, is_told):
     best = make_candidate(0.0, 0.5, 60)
     measured = Measured(HERE, UNKNOWN_ERRORS, 0.05, None, ())
     mirrored = Mirrored(Standing(score / 0.5, score, 60, "drawn scan") if is_known else None)

@@ -24,6 +24,7 @@ OTHERS = {  # corrections of a lens besides its focal length, in words
     "center_y": "principal point",
     "radial": "distortion",
 }
+TOLD_PLACE = 0.5  # chosen: probability of a place of which it is said why it is not certain
 TELLING_STD = 0.03  # [m] deviation of the position by the focal length: a larger one is reported
 
 
@@ -60,7 +61,7 @@ def conclude(frame: MapFrame, case: Case, belief: Belief, min_confidence: float)
     )
     decided = described.take_belief(belief.rule_out(*reasons), min_confidence)
     doubts = () if geometry is None else explain_doubts(geometry, decided.status)
-    if case.fits_as_mirrored and decided.status != LOCALIZED:
+    if case.fits_as_mirrored and decided.status != LOCALIZED and belief.best_place > TOLD_PLACE:
         doubts = (FITS_MIRRORED, *doubts)
     return replace(decided, warnings=(*warnings, *doubts))
 
