@@ -14,8 +14,8 @@ from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.judge.belief import make_belief
 from piccolo.judge.case import UNKNOWN_ERRORS, Case, Geometry, Measured
 from piccolo.judge.conclude import MIRRORED, NOT_AS_CLAIMED
-from piccolo.judge.probability import Mirrored, Standing
-from piccolo.judge.reasons import FITS_MIRRORED, Reason
+from piccolo.judge.probability import Standing
+from piccolo.judge.reasons import Reason
 from piccolo.localization import judging
 from piccolo.photo.camera import Mount
 from piccolo.photo.camera.model import pinhole
@@ -57,27 +57,6 @@ def test_what_lies_mirrored_or_contradicts_its_focal_length_is_ruled_out(
     reasons = {Reason.MIRRORED} if warns else {Reason.SPHERE} if conflict else set()
     assert result.belief == replace(belief, doubt=doubt, ruled_out=frozenset(reasons))
     assert (NOT_AS_CLAIMED in result.warnings) == (Reason.SPHERE in reasons)
-
-
-@pytest.mark.parametrize(
-    ("score", "is_known", "place", "is_told"),
-    [
-        (0.5, True, 0.85, True),
-        (0.49, True, 0.85, False),
-        (0.5, True, 0.95, False),
-        (0.5, True, 0.45, False),
-        (0.5, False, 0.85, False),
-    ],
-)
-def test_a_photo_that_fits_as_well_mirrored_is_told_so_if_it_is_nearly_sure(score, is_known, place, is_told):
-    best = make_candidate(0.0, 0.5, 60)
-    measured = Measured(HERE, UNKNOWN_ERRORS, 0.05, None, ())
-    mirrored = Mirrored(Standing(score / 0.5, score, 60, "drawn scan") if is_known else None)
-    standings = (Standing(1.0, 0.5, 60, "drawn scan"),)
-    case = Case(make_selection(best), standings, measured, None, mirrored)
-    problem = replace(PROBLEM, scan_map=rooms.scan_map(1))
-    result = judging.decide_case(problem, case, make_belief([place]), rooms.means(), 0.9)
-    assert (FITS_MIRRORED in result.warnings) == is_told
 
 
 def test_photos_of_one_wrong_focal_length_are_not_sure_together():

@@ -62,9 +62,3 @@ class Case(NamedTuple):
     def is_mirrored(self) -> bool:
         """True if the mirrored photo fits better."""
         return self.mirrored is not None and self.mirrored.fits_better
-
-    @property
-    def fits_as_mirrored(self) -> bool:
-        """True if the mirrored photo explains as much, though it does not fit better."""
-        standing = self.mirrored and self.mirrored.standing
-        return standing is not None and standing.ratio >= 1.0 and not self.is_mirrored

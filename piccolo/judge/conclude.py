@@ -10,7 +10,7 @@ from .case import Case, Geometry
 from .consensus import MOST_CONFLICT, Opinion
 from .pose_covariance import describe_errors
 from .probability import LOCALIZED
-from .reasons import FITS_MIRRORED, MIRRORED, Reason, explain
+from .reasons import MIRRORED, Reason, explain
 from .result import Result
 from .result_parts import Alternative, FocalLength
 
@@ -24,7 +24,6 @@ OTHERS = {  # corrections of a lens besides its focal length, in words
     "center_y": "principal point",
     "radial": "distortion",
 }
-TOLD_PLACE = 0.5  # chosen: probability of a place of which it is said why it is not certain
 TELLING_STD = 0.03  # [m] deviation of the position by the focal length: a larger one is reported
 
 
@@ -61,8 +60,6 @@ def conclude(frame: MapFrame, case: Case, belief: Belief, min_confidence: float)
     )
     decided = described.take_belief(belief.rule_out(*reasons), min_confidence)
     doubts = () if geometry is None else explain_doubts(geometry, decided.status)
-    if case.fits_as_mirrored and decided.status != LOCALIZED and belief.best_place > TOLD_PLACE:
-        doubts = (FITS_MIRRORED, *doubts)
     return replace(decided, warnings=(*warnings, *doubts))
 
 

@@ -28,7 +28,6 @@ class Contradiction(NamedTuple):
 
 
 MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
-FITS_MIRRORED = "mirrored, left for right, the photo fits the scan as well: its pose is less certain"
 # warnings of poses that contradict prior knowledge
 WORDS: Mapping[Reason, str] = {
     Reason.WITHIN: "the pose found is in the scan {found!r}, not in {given}",
