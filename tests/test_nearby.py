@@ -28,7 +28,7 @@ from piccolo.judge.by_others import (
     weigh_stray,
 )
 from piccolo.judge.candidate import NO_CANDIDATE, NO_CHOICE, Selection
-from piccolo.judge.probability import SYMMETRIC, TURNED_OVER, Mirrored, Standing
+from piccolo.judge.probability import SYMMETRIC, Mirrored, Standing
 from piccolo.judge.reasons import Reason
 from piccolo.judge.result import Result, nothing_found
 from piccolo.judge.result_parts import Alternative
@@ -225,10 +225,7 @@ def test_a_mirrored_photo_that_fits_as_well_is_evidence_against_a_photo_near_oth
 
         monkeypatch.setattr(judging, "find_mirrored", find_mirrored)
         places.append(sum(_nearby(located, nothing_found(), 0.05).belief.place[:-1]))
-    unmirrored = 1.0 / (1.0 + TURNED_OVER)
-    without, with_mirrored = (
-        TRUST * s / place - 1.0 for s, place in zip((1.0, unmirrored), places, strict=True)
-    )
+    without, with_mirrored = (TRUST / place - 1.0 for place in places)
     assert with_mirrored / without == pytest.approx(1.0 + 0.5 / SYMMETRIC, rel=0.01)
 
 

@@ -124,7 +124,8 @@ def share_unmirrored(
 ) -> float:
     """Return the probability that a photo that is right as it is, or mirrored, is so as it is.
 
-    By the photo alone: whatever is known of the place holds for both.
+    By the photo alone: what is known of the place holds for both. Photos of a group are rarely mirrored one
+    by one, so that this does not count near others that are sure.
     """
     if mirrored is None or mirrored.standing is None:
         return 1.0

@@ -27,7 +27,7 @@ from ..judge.by_others import (
     local_share,
     weigh_stray,
 )
-from ..judge.probability import Mirrored, posterior, share_unmirrored
+from ..judge.probability import Mirrored, posterior
 from ..judge.result import Result
 from ..judge.selection import assess, credit_copies
 from ..localization.copies import list_reported
@@ -234,8 +234,7 @@ def judge_nearby(
     odds = near.place[0] / max(near.place[-1], LEAST_NONE) / math.exp(held.candidate.log_by_others)
     local = local_share(odds, MISSED_TURNED if held.is_turned else MISSED)
     within = believe_exact(held.shares, held.exact, local)
-    unmirrored = share_unmirrored(standings, case.mirrored, problem.method)
-    belief = replace(believe_nearby(near, prospect).scale(unmirrored), within=within)
+    belief = replace(believe_nearby(near, prospect), within=within)
     result = decide_case(problem, case, belief, means, demand.min_confidence)
     return result, prospect.gain * (1.0 - near.place[-1]) / max(near.place[-1], LEAST_NONE)
 
