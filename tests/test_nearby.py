@@ -35,7 +35,7 @@ from piccolo.judge.result_parts import Alternative
 from piccolo.localization import judging
 from piccolo.localization.judging import Found
 from piccolo.localization.means import Means
-from piccolo.problem.profile import WHOLE_BEAM
+from piccolo.problem.profile import PROFILES, WHOLE_BEAM
 from piccolo.scan_map.camera_positions import COARSE_SPACING
 from piccolo.system.jobs.threads import Stopwatch
 from piccolo.together import nearby
@@ -189,8 +189,7 @@ def test_a_photo_is_searched_again_only_where_it_was_not(monkeypatch):
 
     def find(problem, scan_map, means):
         found.append(len(problem.scan_map.sparse))
-        assert problem.has_few_places
-        assert problem.beam == WHOLE_BEAM
+        assert problem.profile == replace(PROFILES[1], beam=WHOLE_BEAM, thins_starts=True), "few places"
         return Found(problem, NO_CHOICE, None)
 
     monkeypatch.setattr(nearby, "find", find)

@@ -190,7 +190,7 @@ def search_views(
         thin = means._replace(effort=thin_effort(means.effort))
         refined = search_and_refine(thin_out(problem), tilts, FIRST_BEAM, thin)
     else:
-        refined = search_and_refine(problem, tilts, problem.beam, means)
+        refined = search_and_refine(problem, tilts, problem.profile.beam, means)
     return add_found(problem, refined, known, means)
 
 

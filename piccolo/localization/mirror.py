@@ -54,7 +54,7 @@ def search_level(mirrored: Problem, effort: Effort, workers: Workers) -> list[Ca
     """Return poses of a mirrored photo at its known tilt, else at those of a camera held about level."""
     tilts = "known" if mirrored.photo.has_tilt else mirrored.profile.default_tilt
     starts = search_poses(mirrored, tilts, effort, workers)
-    return refine_starts(mirrored, starts, mirrored.beam, workers)
+    return refine_starts(mirrored, starts, mirrored.profile.beam, workers)
 
 
 def is_explained(method: Method, best: Candidate) -> bool:
@@ -79,7 +79,7 @@ def search_mirrored(
     own_ends = descend_briefly(own, effort.brief(), workers)
     if not is_found_again(own_ends, pose):
         starts = search_poses(turned, "known", effort, workers)
-        return refine_starts(turned, starts, problem.beam, workers)
+        return refine_starts(turned, starts, problem.profile.beam, workers)
     ends = descend_briefly(turned, effort.brief(), workers)
     if ends.best_score < problem.method.decoy_ratio * own_ends.best_score:
         return []

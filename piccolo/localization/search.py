@@ -188,8 +188,7 @@ def search_poses(problem: Problem, tilts: Tilts, effort: Effort, workers: Worker
     samples, validity = turn_panorama(problem.photo.images.search(), rotations)
     profile = problem.profile
     most = effort.max_starts
-    is_thinned = profile.thins_starts or problem.has_few_places
-    num_starts = thin_starts(profile.method, len(m.sparse), most) if is_thinned else most
+    num_starts = thin_starts(profile.method, len(m.sparse), most) if profile.thins_starts else most
     pool = num_starts * profile.method.poses_per_start
     sparse, turn, _ = best_poses_wide(m, samples, validity, pool, num_views, workers, profile.subtracts_means)
     candidate = m.sparse[sparse]

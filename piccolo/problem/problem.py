@@ -22,7 +22,7 @@ from ..views.points_around import Place, RecentViews, round_position
 from ..views.view import Cells, ViewConfig, normalize_view
 from .method import METHOD, Method
 from .photo_images import MIRROR, PhotoImages, make_photo
-from .profile import FEW_PLACES, VIEWS, WHOLE_BEAM, Beam, Profile, choose_profile, choose_scales
+from .profile import VIEWS, Profile, choose_profile, choose_scales
 from .stages import ViewName
 
 MAX_LOSS_WIDTH = 2048  # [px] of the photo for the loss: more costs time and gains nothing
@@ -58,16 +58,6 @@ class Problem:
         """Angle [rad] of a pixel of the photo, or of its largest image if that is coarser."""
         width: int = min(self.given.rgb.shape[1], self.photo.panorama.rgb.shape[1])
         return math.tau / width
-
-    @property
-    def has_few_places(self) -> bool:
-        """True if few places are searched, as within reach of a known one."""
-        return len(self.scan_map.sparse) <= FEW_PLACES
-
-    @property
-    def beam(self) -> Beam:
-        """The numbers of poses that go on from stage to stage."""
-        return WHOLE_BEAM if self.has_few_places else self.profile.beam
 
     def by_views(self) -> "Problem":
         """Return the problem with poses compared by whole views alone, without local features."""

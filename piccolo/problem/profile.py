@@ -81,7 +81,6 @@ SHAPE_STEPS = (
 ROUGH_SHAPE_STEPS = DifferenceSteps("fine", math.radians(0.8), 1.0)
 WHOLE_BEAM = Beam(400, 48, 8, 2)
 PARTIAL_BEAM = Beam(1600, 192, 12, 3)  # many places look like a part of the sphere
-FEW_PLACES = 150  # chosen: so many are within 2 m of a position; few of them look like a part of the sphere
 
 
 @dataclass(frozen=True)
@@ -137,6 +136,10 @@ class Profile:
     def by_views(self) -> "Profile":
         """Return the profile that judges poses by whole views alone; by shape it is always so."""
         return replace(self, evidence="views", is_narrow=False) if self.uses_matches else self
+
+    def near_others(self) -> "Profile":
+        """Return the profile for a search near others: of few places, few look like a part of the sphere."""
+        return replace(self, thins_starts=True, beam=WHOLE_BEAM)
 
 
 def of_part(whole: Profile) -> Profile:

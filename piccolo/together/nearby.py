@@ -101,7 +101,8 @@ def search_nearby(
     near = narrow_around(whole.scan_map, others)
     if len(near.sparse) == 0:
         return None
-    found = find(replace(whole, scan_map=near), scan_map, means)
+    few_places = replace(whole, scan_map=near, profile=whole.profile.near_others())
+    found = find(few_places, scan_map, means)
     gain = len(whole.scan_map.sparse) / len(near.sparse)
     return Searched(found.confirm() if shot.is_confirmed else found, others, gain)
 
