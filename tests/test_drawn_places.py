@@ -105,14 +105,17 @@ def test_the_scan_is_drawn_where_a_photo_may_be_and_first_where_it_is_likely(mon
     places = _places()
     positions = places.positions
     nowhere = np.empty((0, 3))
-    assert places.choose(rooms.scan_map(1).centers, nowhere).tolist() == list(range(len(positions)))
-    assert places.choose(positions[:1] + 0.1, nowhere)[0] == 0
-    assert len(places.choose(positions[:1] + 100.0, nowhere)) == 0
-    assert len(places.choose(nowhere, nowhere)) == 0
+
+    def choose(allowed, likely):
+        return places.choose(allowed, likely, 2).tolist()
+
+    assert choose(rooms.scan_map(1).centers, nowhere) == list(range(len(positions)))
+    assert choose(positions[:1] + 0.1, nowhere)[0] == 0
+    assert choose(positions[:1] + 100.0, nowhere) == []
+    assert choose(nowhere, nowhere) == []
     monkeypatch.setattr(drawn_places, "MOST_DRAWN", 3)
-    monkeypatch.setattr(drawn_places, "MOST_LIKELY", 2)
-    assert places.choose(positions, nowhere).tolist() == [0, 1, 2]
+    assert choose(positions, nowhere) == [0, 1, 2]
     for k in range(len(positions)):
-        chosen = places.choose(positions, positions[k : k + 1]).tolist()
+        chosen = choose(positions, positions[k : k + 1])
         assert chosen[0] == k
         assert len(chosen) == 2

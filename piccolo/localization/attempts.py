@@ -139,7 +139,8 @@ def look_along_walls(problem: Problem, known: list[Candidate], means: Means) -> 
 def search_features(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
     """Match a photo with the scan drawn at its places, some at a time; True if the result is sure.
 
-    Poses by the first places are dropped unless one is sure: all places together give better ones.
+    The places nearest to known candidates come first. Poses by some places are dropped unless one is sure:
+    all places together give better ones.
     """
     workers = means.workers
     places = problem.scan_map.places
@@ -148,15 +149,16 @@ def search_features(problem: Problem, known: list[Candidate], means: Means) -> t
     with means.watch.stage("match"):
         keypoints = find_all_around(problem.photo, workers)
     likely = np.array([one.pose.center_world for one in known]).reshape(-1, 3)
-    chosen = places.choose(problem.scan_map.centers[problem.scan_map.sparse], likely)
+    allowed = problem.scan_map.centers[problem.scan_map.sparse]
+    chosen = places.choose(allowed, likely, problem.profile.most_places)
     for begin in range(0, len(chosen), PLACES_AT_ONCE):
         end = begin + PLACES_AT_ONCE
         with means.watch.stage("match"):
             pictures = places.draw(chosen[begin:end].tolist(), workers)
             matched += workers.map(partial(match_located, keypoints), pictures, "match")
             poses = propose_level(problem, merge_matches(matched), workers)
-            is_last = end >= len(chosen)
-            if not is_last and (not poses or poses[0].num_matches < problem.method.enough_matches):
+            is_tried = end >= len(chosen) or (begin == 0 and len(known) > 0)
+            if not is_tried and (not poses or poses[0].num_matches < problem.method.enough_matches):
                 continue
             refined = refine_matches(problem, [one.pose for one in poses], workers)
             found, is_enough = end_search(problem, known + add_verified(problem, refined, workers), workers)

@@ -106,6 +106,9 @@ class Profile:
     # the refinement
     beam: Beam = WHOLE_BEAM
     first: Stage = FIRST  # the short descent from each start
+    # Chosen: the largest number of places near candidates at which the scan is drawn, which takes half a minute
+    # of a processor at most. With 32, three of twelve tilted panoramas of which 40 % is hidden are not found.
+    most_places: int = 256
     refines_on_matches: bool = False  # at candidates with many matches, a pose is refined on them
     soft: tuple[Stage, ...] = ()  # stages before the first descent on points
     settles_near: bool = False  # a descent near a given pose is slow: it goes on with occluders masked
@@ -157,6 +160,7 @@ def of_part(whole: Profile) -> Profile:
         scores_again=False,
         beam=PARTIAL_BEAM,
         first=SECOND,  # a part of the sphere needs more iterations
+        most_places=32,  # by trials: more find no more
         refines_on_matches=True,
         settles_near=True,
         most_rivals=None,

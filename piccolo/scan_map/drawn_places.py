@@ -35,9 +35,7 @@ STOREY_CELL = np.array([2.5, 2.5, 3.0])  # [m] around: a part of a storey
 TABLE_HEIGHT = 48  # rows of directions, 3.75 degrees each
 SLACK = 1.0  # [m] a wall is so much nearer than what is behind it
 FIRST_ROOM = 64  # positions, at first
-MOST_DRAWN = 512  # at which the scan is drawn for a photo
-# of nine panoramas hidden to 60 %, a position near the camera was among the nine nearest to candidates
-MOST_LIKELY = 32  # the same of a photo with candidates, which views found
+MOST_DRAWN = 512  # at which the scan is drawn for a photo without candidates
 MOST_DRAWN_KEPT = 1024  # that are kept, 0.2 GB
 Look = Callable[[int], Array32]  # ranges (cells,) [m] seen from a candidate, 0 for nothing
 
@@ -57,17 +55,17 @@ class DrawnPlaces:
         """Positions (P, 3) [m] of the pictures, in the map's frame."""
         return self._positions()
 
-    def choose(self, allowed: Array, likely: Array) -> Int64s:
+    def choose(self, allowed: Array, likely: Array, most_likely: int) -> Int64s:
         """Return the indices (n,) of positions near any of allowed centers (N, 3) [m].
 
-        With likely centers (K, 3), those are the MOST_LIKELY nearest to them, else MOST_DRAWN.
+        With likely centers (K, 3), those are the `most_likely` nearest to them, else MOST_DRAWN.
         """
         positions = self.positions
         near = [k for k, one in enumerate(positions) if measure_nearest(one, allowed) < NEAR]
         if len(likely) == 0:
             return np.array(near[:MOST_DRAWN], np.int64)
         near.sort(key=lambda k: measure_nearest(positions[k], likely))
-        return np.array(near[:MOST_LIKELY], np.int64)
+        return np.array(near[:most_likely], np.int64)
 
     def draw(self, places: Sequence[int], workers: Workers) -> list[Located]:
         """Return the pictures at some of the positions."""
