@@ -266,24 +266,28 @@ def test_attempts_are_made_until_one_is_sure(sure, num_made):
 
 
 @pytest.mark.parametrize(
-    ("num_places", "num_matches", "has_rival", "num_drawn", "is_sure"),
+    ("num_places", "place", "num_matches", "has_rival", "num_drawn", "is_sure"),
     [
-        (2, 40, False, 1, True),
-        (2, 39, False, 2, True),
-        (2, 40, True, 2, False),
-        (2, 3, False, 2, False),
-        (1, 39, True, 1, False),
-        (1, 39, False, 1, True),
+        (2, 0, 40, False, 1, True),
+        (2, 0, 39, False, 1, True),
+        (3, 1, 40, False, 2, True),
+        (3, 1, 39, False, 3, True),
+        (2, 0, 40, True, 2, False),
+        (2, 0, 3, False, 2, False),
+        (1, 0, 39, True, 1, False),
+        (1, 0, 39, False, 1, True),
     ],
 )
 def test_some_of_the_places_count_where_these_leave_no_doubt(
-    num_places, num_matches, has_rival, num_drawn, is_sure, monkeypatch
+    num_places, place, num_matches, has_rival, num_drawn, is_sure, monkeypatch
 ):
-    """As many matches as a clear whole view is worth, and no pose of the first look near it."""
+    """The likely ones, or as many matches as a clear whole view is worth; no pose of the first look near."""
     true = rooms.scene(1)[2]
-    matches = iter([exact_matches(true, num_matches), NO_MATCHES])
+    exact = exact_matches(true, num_matches)
     monkeypatch.setattr(attempts, "PLACES_AT_ONCE", 1)
-    monkeypatch.setattr(attempts, "match_located", lambda keypoints, picture: next(matches))
+    monkeypatch.setattr(
+        attempts, "match_located", lambda keypoints, picture: exact if picture == place else NO_MATCHES
+    )
     problem = _problem(rooms.scene(1)[1], rooms.UNKNOWN)
     drawn = []
     pictures = SimpleNamespace(
@@ -297,7 +301,7 @@ def test_some_of_the_places_count_where_these_leave_no_doubt(
     found, is_enough = attempts.search_features(problem, [looked], rooms.means())
     assert found[0].pose is looked.pose
     assert is_enough == is_sure
-    assert drawn == [[0], [1]][:num_drawn]
+    assert drawn == [[0], [1], [2]][:num_drawn]
     assert len(found) == (1 if num_matches == 3 else 2)
     assert all(RIGHT.holds(h.pose, true) for h in found[1:])
 

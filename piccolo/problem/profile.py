@@ -106,8 +106,8 @@ class Profile:
     # the refinement
     beam: Beam = WHOLE_BEAM
     first: Stage = FIRST  # the short descent from each start
-    # Chosen: the largest number of places near candidates at which the scan is drawn, which takes half a minute
-    # of a processor at most. With 32, three of twelve tilted panoramas of which 40 % is hidden are not found.
+    # Chosen: the largest number of places near candidates at which the scan is drawn: half a minute of a core
+    # at most. With 32, three of twelve tilted panoramas of which 40 % is hidden are not found.
     most_places: int = 256
     refines_on_matches: bool = False  # at candidates with many matches, a pose is refined on them
     soft: tuple[Stage, ...] = ()  # stages before the first descent on points
