@@ -272,7 +272,7 @@ def test_attempts_are_made_until_one_is_sure(sure, num_made):
         (2, 0, 39, False, 1, True),
         (3, 1, 40, False, 2, True),
         (3, 1, 39, False, 3, True),
-        (2, 0, 40, True, 2, False),
+        (2, 0, 40, True, 1, False),
         (2, 0, 3, False, 2, False),
         (1, 0, 39, True, 1, False),
         (1, 0, 39, False, 1, True),
