@@ -103,6 +103,24 @@ def test_a_photos_grid_turns_it_and_does_not_move_it(found):
     np.testing.assert_allclose(added, expected, atol=1e-6 * expected.max())
 
 
+def test_noisy_surfaces_move_a_camera_and_do_not_turn_it(found):
+    prepared, pose, _ = found
+    candidate = examine(prepared, pose)
+    surface = np.diag([4e-4, 1e-4, 2e-4])
+
+    def tell(scan_map):
+        return covariance.estimate_covariance(
+            replace(prepared, scan_map=scan_map), candidate, WORKERS
+        ).gaussian
+
+    clean = replace(prepared.scan_map, surface_variance=np.zeros((3, 3)))
+    noisy = tell(replace(clean, surface_variance=surface))
+    expected = np.zeros((6, 6))
+    expected[3:, 3:] = surface
+    np.testing.assert_allclose(noisy.common - tell(clean).common, expected, atol=1e-12)
+    np.testing.assert_allclose(noisy.covariance - tell(clean).covariance, expected, atol=1e-9)
+
+
 def test_steps_displace_near_points_as_much_as_turns_do(found, monkeypatch):
     """A tenth of the points is near: they tell most of a position, and the median range would ignore them."""
     prepared, pose, _ = found

@@ -40,7 +40,6 @@ from .verification import draw_near, place_by_matches
 
 LEAST_INFORMATION = 1e-12  # in any direction, as a fraction of that in the best-known direction
 LEAST_BLOCKS = 13  # with fewer, errors in six dimensions can't be estimated
-UNCALIBRATED = 0.005  # deviation of a focal length's logarithm from which the camera is not calibrated
 LEAST_STEP_RANGE = 0.005 / math.radians(0.1)  # [m] least range: steps for nearer points would drown in noise
 LEAST_ACTING = 0.25  # [m] distance of points that count: nearer ones are noise, as cameras stand clear
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
@@ -272,8 +271,8 @@ def compute_covariance(photo: PhotoImages, points: Cells, pose: Pose, profile: P
 
 def common_covariance(problem: Problem, pose: Pose, acting_range: float) -> Array:
     """Return the covariance (6, 6) of errors of the scan, which all photos at a pose in the map share."""
-    of_scan = scan_covariance(problem.scan_map, acting_range)
-    return of_scan + layer_covariance(problem.scan_map, pose, acting_range)
+    of_layers = layer_covariance(problem.scan_map, pose, acting_range)
+    return scan_covariance(problem.scan_map) + of_layers
 
 
 def grid_covariance(problem: Problem) -> Array:
@@ -282,10 +281,7 @@ def grid_covariance(problem: Problem) -> Array:
     Rows and columns that are displaced together turn the photo. How far they move it is among the errors of
     its geometry: of its horizon or principal point.
     """
-    prior = problem.given.focal_prior
-    method = problem.method
-    is_calibrated = prior is None or prior.deviation < UNCALIBRATED
-    turn = (method.pixel_share if is_calibrated else method.uncalibrated_share) * problem.pixel
+    turn = problem.method.pixel_share * problem.pixel
     return np.diag(np.repeat([turn**2, 0.0], 3))
 
 
@@ -316,7 +312,7 @@ def estimate_pose_errors(problem: Problem, candidate: Candidate, workers: Worker
     if errors.gaussian is not None:
         found = errors.gaussian.fuse(PoseGaussian(*by_matches, errors.gaussian.common))
     elif (candidate.num_matches or 0) >= problem.method.sure_matches:
-        found = PoseGaussian(*by_matches, scan_covariance(problem.scan_map, acting_range) + of_layers)
+        found = PoseGaussian(*by_matches, scan_covariance(problem.scan_map) + of_layers)
     else:
         return errors
     if contradictions(problem.scan_map, found.pose, problem.prior):
@@ -352,7 +348,7 @@ def estimate_covariance(
     turned = pose.R_cam_from_world.T  # R_map_from_cam
     acting_range = compute_acting_range(points)
     own = turn_positions(covariance, turned) + grid_covariance(problem)
-    common = scan_covariance(problem.scan_map, acting_range)
+    common = scan_covariance(problem.scan_map)
     common = common + (1.0 - profile.own_share) * own
     own = profile.own_share * own
     std_of_fit = compute_std_of_fit(own + common, acting_range)

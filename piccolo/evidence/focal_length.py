@@ -36,7 +36,7 @@ from ..system.arrays import Array, Mask
 from ..system.jobs.threads import Workers
 from ..views.view import Cells
 from .comparison import mask_occluders
-from .covariance import UNCALIBRATED, compute_acting_range
+from .covariance import compute_acting_range
 from .lens_matches import MOST_LENS_CHANGE, MatchFit, add_matches, fit_matches
 from .scan_errors import displacement_variance
 from .self_calibration import (
@@ -52,6 +52,7 @@ from .verification import draw_near
 
 K1_DEVIATION = 0.05  # prior deviation of k1, if the camera is a guess
 FITTED = [FOCAL, LENS.index("radial")]  # corrections that are applied; the others widen the covariance
+UNCALIBRATED = 0.005  # deviation of a focal length's logarithm from which the camera is not calibrated
 # deviations of the other corrections: of a calibration, and of a focal length alone
 CALIBRATED = (0.002, 0.003, 0.003, 0.005)
 NOT_CALIBRATED = (0.002, 0.005, 0.005, 0.008)

@@ -10,16 +10,15 @@ SHAPE_TURN = 0.003  # [rad] by which edges of a photo are displaced from the sca
 SHAPE_MOVE = 0.01  # [m]
 
 
-def scan_covariance(scan_map: ScanMap, acting_range: float) -> Array:
+def scan_covariance(scan_map: ScanMap) -> Array:
     """Return the covariance (6, 6) [rad, m], in the map's axes, of errors of the scan.
 
     They are correlated over many blocks: errors of noise and doubled surfaces (`surface_variance`), and in a
-    scan without colours those of its edges.
+    scan without colours those of its edges. Noise and doubled surfaces move a camera, but do not turn it: in
+    scans with noise of 1 to 5 cm, and doubled by as much, rotations were as exact as the photo alone says.
     """
-    surface = scan_map.surface_variance
     covariance = np.zeros((6, 6))
-    covariance[:3, :3] = np.eye(3) * np.trace(surface) / 3.0 / acting_range**2
-    covariance[3:, 3:] = surface
+    covariance[3:, 3:] = scan_map.surface_variance
     if scan_map.has_shape:
         covariance += np.diag(np.repeat([SHAPE_TURN**2, SHAPE_MOVE**2], 3))
     return covariance
@@ -38,7 +37,7 @@ def layer_covariance(scan_map: ScanMap, pose: Pose, acting_range: float) -> Arra
 
 def displacement_variance(scan_map: ScanMap, pose: Pose, acting_range: float) -> Array:
     """Return the covariance (3, 3) [m^2], in the map's axes, of the scan's surfaces about the true ones."""
-    common = scan_covariance(scan_map, acting_range) + layer_covariance(scan_map, pose, acting_range)
+    common = scan_covariance(scan_map) + layer_covariance(scan_map, pose, acting_range)
     return common[3:, 3:] + scan_map.displacement**2 * np.eye(3)
 
 

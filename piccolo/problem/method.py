@@ -49,7 +49,6 @@ class Method:
 
     # errors and doubts
     pixel_share: float = 0.04  # [px] error that stays in a pose, by trials with photos of 256 and 2048 px
-    uncalibrated_share: float = 0.15  # [px] the same if principal point and distortion are not known
     # least score of halves of a photo that disagree. By chance it is 1 in the mean; the largest for nine
     # planes is above this in a quarter of the photos
     halves_score: float = 3.0
