@@ -46,6 +46,16 @@ def test_furniture_tells_up_in_a_turned_room(seed, w):
     assert np.degrees(np.arctan2(np.linalg.norm(np.cross(up, true_up)), up @ true_up)) < 0.5
 
 
+@pytest.mark.parametrize("seed", [1, 2, 4])
+@pytest.mark.parametrize("rise", [0.8, 2.2])
+def test_each_building_on_a_slope_has_its_own_floors(seed, rise):
+    """With the heights of all together up was not known, or down."""
+    points = room(seed)[1].points.astype(float)
+    buildings = [points + np.array([20.0 * (k % 2), 20.0 * (k // 2), rise * k]) for k in range(4)]
+    up, _ = up_of(np.concatenate(buildings), TURNS[0])
+    assert up @ exp_so3(TURNS[0]) @ Z > np.cos(np.radians(0.5))
+
+
 def test_two_far_strays_change_little():
     strays = np.float32([[1e4, 0, 0], [0, -1e4, 1e4]])
     up, _ = up_of(np.concatenate([room(1)[1].points, strays]), TURNS[0])

@@ -26,6 +26,8 @@ MIN_ALIGNED = 0.6  # least fraction of the planes' area that is level or upright
 LEVEL_ANGLE = np.radians(8.0)  # between a level surface's normal and the vertical: ramps to 1 : 7 count
 PERSON_HEIGHT = 1.9  # [m]
 FURNITURE = 0.3, 1.2  # [m] heights of seats, tables, counters, shelves above the floor
+BUILDING_GAP = 3.0  # [m] buildings with a cell so wide without points between them lie apart
+LEAST_BUILDING = 0.02  # of the points, that a building has at least
 WALKABLE_STEP = 0.3  # [m] people walk over lower things
 WALKING_CELL = 0.25  # [m] of the grid in which free floor is found; larger in wide scans
 FLOOR_REACH = 2  # cells between the points of a floor, or between free space and the next thing over a floor
@@ -127,7 +129,7 @@ def find_up(octree: Octree) -> tuple[Array, float, str, DominantPlanes]:
         return axis, 0.0, "too many planes are neither horizontal nor vertical", planes
     if height > 0.75 * width:
         return axis, 0.0, f"{height:.1f} m high and {width:.1f} m wide, a wall may be the floor", planes
-    return axis, *find_sense(cloud, find_levels(planes, axis), axis, heights, places), planes
+    return axis, *find_sense(cloud, planes, axis, heights, places), planes
 
 
 def level(planes: DominantPlanes, given_up: Array) -> Array:
@@ -180,24 +182,50 @@ def find_yaw_of_walls(octree: Octree) -> float | None:
 
 
 def find_sense(
-    cloud: PointNormals, levels: Array, axis: Array, heights: Array, places: Array
+    cloud: PointNormals, planes: DominantPlanes, axis: Array, heights: Array, places: Array
 ) -> tuple[float, str]:
     """Return 1 if up is along a vertical (3,), -1 if against it, 0 if that is not clear; and the reason.
 
-    `levels` (L,) [m] are the heights of floors and ceilings along the vertical; `heights` (M,) [m] and
-    `places` (M, 2) [m] are the points' heights and their positions in the plan.
+    `heights` (M,) [m] and `places` (M, 2) [m] are the points' heights along the vertical and their positions
+    in the plan. Each building has floors at its own heights, so that each has its own cues; a building counts
+    by its points.
     """
-    if len(levels) < 2:
+    found = []
+    for is_part in list_buildings(places):
+        part = PointNormals(cloud.points[is_part], cloud.normals[is_part], cloud.is_flat[is_part])
+        levels = find_levels(planes if is_part.all() else ransac_planes(part), axis)
+        if len(levels) >= 2:
+            is_level = part.is_flat & (np.abs(dot_products(part.normals, axis)) > np.cos(LEVEL_ANGLE))
+            furniture = furniture_cue(heights[is_part], is_level, levels)
+            passage = passage_cue(heights[is_part], is_level, levels, places[is_part])
+            found.append([furniture, passage, float(np.diff(levels).max()), float(is_part.sum())])
+    if not found:
         return 0.0, "a floor and a ceiling are not both among the dominant planes"
-    is_level = cloud.is_flat & (np.abs(dot_products(cloud.normals, axis)) > np.cos(LEVEL_ANGLE))
-    passages = passage_cue(heights, is_level, levels, places)
-    cues = np.array([furniture_cue(heights, is_level, levels), passages])
+    furniture_cues, passage_cues, highest, counts = np.array(found).T
+    cues = np.average([furniture_cues, passage_cues], axis=1, weights=counts)
     sense = float(np.sign(cues.sum()))
     # least value of the smaller cue: in high storeys, whose trusses look like tables, both cues must agree
-    least = 0.3 if np.diff(levels).max() > 4.0 else -0.5
+    least = 0.3 if highest.max() > 4.0 else -0.5
     is_plain = sense * cues.sum() > 1.0 and (sense * cues).min() > least
     reason = "furniture {:+.1f}, free space {:+.1f}".format(*sense * cues)
     return (sense, reason) if is_plain else (0.0, f"floor and ceiling look alike: {reason}")
+
+
+def list_buildings(places: Array) -> list[Mask]:
+    """Return masks (M,) of the points in each part of the plan that lies apart; of all if only one is large.
+
+    `places` (M, 2) [m] are the points' positions in the plan.
+    """
+    from scipy import ndimage  # noqa: PLC0415  # imported only when up is estimated
+
+    low, high = np.quantile(places, [0.001, 0.999], axis=0)
+    cells = (np.clip(places, low, high) - low) // BUILDING_GAP
+    cells = cells.astype(np.intp)
+    grid = np.zeros(cells.max(axis=0) + 1, bool)
+    grid[tuple(cells.T)] = True
+    parts = ndimage.label(grid, np.ones((3, 3)))[0][tuple(cells.T)]
+    large = np.flatnonzero(np.bincount(parts) > LEAST_BUILDING * len(places))
+    return [parts == k for k in large] if len(large) > 1 else [np.ones(len(places), bool)]
 
 
 def find_levels(planes: DominantPlanes, axis: Array) -> Array:
