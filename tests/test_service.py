@@ -19,7 +19,6 @@ from batches import workers_of
 from plyfile import PlyData, PlyElement
 from services import serving
 
-from piccolo.apps.service.asking import clean_name
 from piccolo.apps.service.description import describe_service
 from piccolo.cli import localize
 from piccolo.judge.result import Result
@@ -313,24 +312,6 @@ def test_null_is_not_given(service, photo, expected):
     assert status == 200
     assert _same(json.loads(body), expected)
     assert service.post("/localize", "a.jpg", photo, asked)[0] == 200
-
-
-@pytest.mark.parametrize(
-    ("given", "name"),
-    [
-        ("a.jpg", "a.jpg"),
-        ("../../etc/passwd", "passwd"),
-        ("C:\\x\\b.png", "b.png"),
-        ("Tom & Jerry's <1> 😀 50 %.jpg", "Tom & Jerry's <1> 😀 50 %.jpg"),
-        (".hidden.jpg", ".hidden.jpg"),
-        ("..", "photo"),
-        ("", "photo"),
-        ("a\0/b\r\n.jpg", "b__.jpg"),
-        ("x" * 300 + ".jpg", "x" * 236 + ".jpg"),
-    ],
-)
-def test_names_are_no_paths(given, name):
-    assert clean_name(given) == name
 
 
 def test_a_worker_that_is_killed_costs_no_answer(service, photo, expected):

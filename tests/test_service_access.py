@@ -1,4 +1,4 @@
-"""Who may ask a service: others with a token, through a proxy, from pages of other sites."""
+"""Who may ask a service: others with a token, through a proxy, from pages of other sites; names of photos."""
 
 import socket
 from contextlib import contextmanager
@@ -7,6 +7,7 @@ import pytest
 from refusals import assert_input_error
 from services import serving
 
+from piccolo.apps.service.asking import clean_name
 from piccolo.apps.service.serve import check_url
 
 TIER = "process"
@@ -88,3 +89,21 @@ def test_an_address_ends_in_a_slash(url, page):
 def test_what_is_no_address_is_refused(url):
     assert_input_error("`public_url`: found .*, wanted http", check_url, "public_url", url, True)
     assert_input_error("wanted http\\(s\\)://HOST$", check_url, "allow_origin", f"{SHOP}/page", False)
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ("a.jpg", "a.jpg"),
+        ("../../etc/passwd", "passwd"),
+        ("C:\\x\\b.png", "b.png"),
+        ("Tom & Jerry's <1> 😀 50 %.jpg", "Tom & Jerry's <1> 😀 50 %.jpg"),
+        (".hidden.jpg", ".hidden.jpg"),
+        ("..", "photo"),
+        ("", "photo"),
+        ("a\0/b\r\n.jpg", "b__.jpg"),
+        ("x" * 300 + ".jpg", "x" * 236 + ".jpg"),
+    ],
+)
+def test_names_are_no_paths(given, name):
+    assert clean_name(given) == name
