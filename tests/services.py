@@ -5,6 +5,7 @@ import json
 import signal
 import subprocess
 import sys
+import threading
 import uuid
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+PATIENCE_S = 60.0  # for a message that has to come
 
 
 class Client:
@@ -27,6 +29,15 @@ class Client:
         if not self.is_told_to_end and self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
         self.is_told_to_end = True
+
+    def says(self, words):
+        """Wait for a message with these words; False if it ends, or is ended, before it says them."""
+        patience = threading.Timer(PATIENCE_S, self.process.kill)
+        patience.start()
+        try:
+            return any(words in line for line in self.process.stderr)
+        finally:
+            patience.cancel()
 
     def ask(self, method, path, body=b"", **headers):
         """Status, headers and body of an answer."""

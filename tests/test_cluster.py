@@ -16,6 +16,8 @@ from research.evaluation import evaluate
 
 TIER = "process"
 
+pytestmark = pytest.mark.usefixtures("searched_once")
+
 PANOS = [f"images/clean_{k % 3}.jpg" for k in range(12)]
 
 

@@ -19,9 +19,11 @@ from piccolo.system.jobs.threads import num_cores
 
 TIER = "process"
 
+pytestmark = pytest.mark.usefixtures("searched_once")
+
 
 @pytest.fixture(scope="module")
-def many(scene, tmp_path_factory):
+def many(scene, tmp_path_factory, searched_once):
     """A list that names two dozen panoramas, and their results by one process."""
     folder = tmp_path_factory.mktemp("many")
     panos = [str(scene / "images" / f"clean_{k % 3}.jpg") for k in range(24)]

@@ -27,7 +27,7 @@ PATIENCE = 120.0  # [s]
 def scene(tmp_path_factory):
     """Options of a scan and two photos, and a file of their relative poses."""
     folder = tmp_path_factory.mktemp("killed")
-    cloud = rooms.write_cloud(folder / "scan.ply", SEED, 40_000)
+    cloud = rooms.write_cloud(folder / "scan.ply", SEED, 20_000)
     queries = [rooms.query(SEED, index=k, width=WIDTH) for k in range(2)]
     photos = [folder / f"photo {k}.png" for k in range(2)]
     for path, query in zip(photos, queries, strict=True):
@@ -48,17 +48,14 @@ def _wait_for_step(process, out, num_lines):
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize(
-    ("kind", "num_lines"), [("photos", 1), ("walk", 2), ("relative", 0), ("together", 0), ("color", 4)]
-)
-@pytest.mark.usefixtures("coarse_colors")
+@pytest.mark.parametrize(("kind", "num_lines"), [("walk", 2), ("relative", 0), ("together", 0), ("color", 4)])
+@pytest.mark.usefixtures("coarse_colors", "searched_once")
 def test_a_job_that_is_killed_goes_on(scene, tmp_path, kind, num_lines):
     folder, words = scene
 
     def words_of(name):
         colored = tmp_path / f"{name}.ply"
         more = {
-            "photos": [],
             "walk": ["--walk", "--times", "names"],
             "relative": ["--relative", str(folder / "relative.json")],
             "together": ["--together"],

@@ -1,6 +1,5 @@
-"""Who may ask a service: others with a token, through a proxy, from pages of other sites."""
+"""Who may ask a service: others with a token, through a proxy, from pages of other sites; names of photos."""
 
-import json
 import socket
 from contextlib import contextmanager
 
@@ -8,6 +7,7 @@ import pytest
 from refusals import assert_input_error
 from services import serving
 
+from piccolo.apps.service.asking import clean_name
 from piccolo.apps.service.serve import check_url
 
 TIER = "process"
@@ -71,13 +71,6 @@ def test_a_page_behind_a_proxy_and_pages_of_another_site(scene):
         assert client.ask("OPTIONS", "/localize", Origin="https://evil.example", **told)[0] == 400
 
 
-def test_a_refusal_says_what_a_proxy_needs(scene):
-    with serving("--cloud", scene / "cloud.ply", "--cache", scene.parent / "maps", "--jobs", "1") as client:
-        for asked in ({"Host": "scans.example"}, {"Origin": "https://scans.example"}):
-            status, _, body = client.post("/localize", "a.jpg", b"", **asked)
-            assert (status, "`public_url`" in json.loads(body)["error"]) == (403, True)
-
-
 @pytest.mark.parametrize(
     ("url", "page"),
     [
@@ -96,3 +89,21 @@ def test_an_address_ends_in_a_slash(url, page):
 def test_what_is_no_address_is_refused(url):
     assert_input_error("`public_url`: found .*, wanted http", check_url, "public_url", url, True)
     assert_input_error("wanted http\\(s\\)://HOST$", check_url, "allow_origin", f"{SHOP}/page", False)
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ("a.jpg", "a.jpg"),
+        ("../../etc/passwd", "passwd"),
+        ("C:\\x\\b.png", "b.png"),
+        ("Tom & Jerry's <1> 😀 50 %.jpg", "Tom & Jerry's <1> 😀 50 %.jpg"),
+        (".hidden.jpg", ".hidden.jpg"),
+        ("..", "photo"),
+        ("", "photo"),
+        ("a\0/b\r\n.jpg", "b__.jpg"),
+        ("x" * 300 + ".jpg", "x" * 236 + ".jpg"),
+    ],
+)
+def test_names_are_no_paths(given, name):
+    assert clean_name(given) == name

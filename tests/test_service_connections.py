@@ -63,16 +63,26 @@ def test_silent_connections_and_unfinished_uploads_keep_nobody_out(scene, photo)
     assert len(client.rest.splitlines()) < 5
 
 
-def test_who_leaves_is_not_computed(scene, tmp_path, photo):
-    words = ["--cloud", scene / "cloud.ply", "--cache", scene.parent / "maps", "--jobs", "1"]
-    with serving(*words, "--keep", tmp_path) as client:
-        with _connected(client.port, 12, _request(photo)):
-            while json.loads(client.ask("GET", "/health")[2])["waiting"] < 6:
-                time.sleep(0.01)
-        assert client.post("/localize", "a.jpg", photo)[0] == 200
-        assert json.loads(client.ask("GET", "/health")[2])["waiting"] == 0
+@pytest.fixture(scope="module")
+def keep(tmp_path_factory):
+    return tmp_path_factory.mktemp("keep")
+
+
+@pytest.fixture(scope="module")
+def service(scene, keep):
+    words = ["--cache", scene.parent / "maps", "--jobs", "1", "--keep", keep]
+    with serving("--cloud", scene / "cloud.ply", *words) as client:
+        yield client
     assert "Task exception" not in client.rest
-    assert len((tmp_path / "results.jsonl").read_text().splitlines()) < 12
+
+
+def test_who_leaves_is_not_computed(service, keep, photo):
+    with _connected(service.port, 12, _request(photo)):
+        while json.loads(service.ask("GET", "/health")[2])["waiting"] < 6:
+            time.sleep(0.01)
+    assert service.post("/localize", "a.jpg", photo)[0] == 200
+    assert json.loads(service.ask("GET", "/health")[2])["waiting"] == 0
+    assert len((keep / "results.jsonl").read_text().splitlines()) < 12
 
 
 async def _echo(scope, receive, send):
@@ -145,20 +155,19 @@ def test_who_does_not_read_is_ended(monkeypatch):
     assert _run(monkeypatch, talk) < 20_000_000
 
 
-def test_a_kept_connection_is_answered_at_once(scene):
-    with serving("--cloud", scene / "cloud.ply", "--cache", scene.parent / "maps", "--jobs", "1") as client:
-        connection = http.client.HTTPConnection("127.0.0.1", client.port)
-        seconds = []
-        for _ in range(9):
-            start = time.perf_counter()
-            connection.request(
-                "GET", "/health", headers={"Content-Length": "5"} if not seconds else {}, body=None
-            )
-            if not seconds:
-                connection.send(b"12345")
-            connection.getresponse().read()
-            seconds.append(time.perf_counter() - start)
-        connection.close()
+def test_a_kept_connection_is_answered_at_once(service):
+    connection = http.client.HTTPConnection("127.0.0.1", service.port)
+    seconds = []
+    for _ in range(9):
+        start = time.perf_counter()
+        connection.request(
+            "GET", "/health", headers={"Content-Length": "5"} if not seconds else {}, body=None
+        )
+        if not seconds:
+            connection.send(b"12345")
+        connection.getresponse().read()
+        seconds.append(time.perf_counter() - start)
+    connection.close()
     assert sorted(seconds)[4] < 0.03
 
 

@@ -76,8 +76,9 @@ def _assert_works(client, keep, content):
     assert all(json.loads(line)["status"] == "localized" for line in lines)
 
 
-@pytest.mark.parametrize("path", ["/localize", "/show"])
-@pytest.mark.parametrize("limit", [0, 1000, "the photo"])
+@pytest.mark.parametrize(
+    ("limit", "path"), [(0, "/localize"), (1000, "/show"), ("the photo", "/localize"), ("the photo", "/show")]
+)
 def test_no_room_to_keep_a_photo(service, keep, photo, limit, path):
     with _limited(service.process.pid, FULL, len(photo) - 1 if limit == "the photo" else limit):
         _assert_refused(service, keep, photo, 507, path)
@@ -85,7 +86,6 @@ def test_no_room_to_keep_a_photo(service, keep, photo, limit, path):
 
 
 def test_no_room_for_the_line_of_a_photo(service, keep, photo):
-    _assert_works(service, keep, photo)
     results = keep / "results.jsonl"
     while results.stat().st_size <= len(photo):
         with results.open("a") as file:
@@ -103,7 +103,6 @@ def test_no_room_for_an_upload(service, keep, photo):
 
 @pytest.mark.parametrize("limit", [0, 1000])
 def test_no_room_where_a_process_is_at_work(service, keep, photo, limit):
-    _assert_works(service, keep, photo)
     (worker,) = workers_of(service.process)
     with _limited(worker, FULL, limit):
         _assert_refused(service, keep, photo, 507)
@@ -123,7 +122,6 @@ def test_a_thumbnail_that_can_not_be_kept_costs_no_photo(service, keep, photo):
 
 @pytest.mark.parametrize("more", range(2))
 def test_too_many_files_where_a_process_is_at_work(service, keep, photo, more):
-    _assert_works(service, keep, photo)
     (worker,) = workers_of(service.process)
     with _limited(worker, NO_FILE, _next_file(worker) + more):
         _assert_refused(service, keep, photo, 503)
