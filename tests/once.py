@@ -3,7 +3,7 @@
 import pickle
 
 from piccolo.api import scan_photo
-from piccolo.together import members
+from piccolo.together import among, members
 
 
 def _content(panorama):
@@ -30,8 +30,8 @@ def _share(patch, owner, name, key):
     patch.setattr(owner, name, ask)
 
 
-def search_alone_once(patch):
-    """Share what photos find by themselves, for each number of threads.
+def search_alone_once(patch, is_per_threads=True):
+    """Share what photos find by themselves, for each number of threads unless that is not the subject.
 
     A search whose steps are noted is not shared.
     """
@@ -40,9 +40,10 @@ def search_alone_once(patch):
         traced = object() if shot.trace.is_wanted else None
         known = before and tuple(one.pose.key for one in before.found.selection.candidates)
         photo = (_content(shot.panorama), shot.settings, known)
-        return _points(scan_map), photo, workers.num_threads, traced
+        return _points(scan_map), photo, workers.num_threads if is_per_threads else None, traced
 
-    _share(patch, members, "find_alone", alone)
+    for owner in (members, among):
+        _share(patch, owner, "find_alone", alone)
 
 
 def search_photos_once(patch):

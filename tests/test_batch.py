@@ -334,6 +334,7 @@ def test_files_left_out_are_counted_and_links_to_folders_searched(scene, tmp_pat
 def test_a_signal_ends_a_batch_after_the_photo_at_work(scene, out):
     name = str(scene / "images" / "clean_0.jpg")
     words = ["--cloud", str(scene / "cloud.ply"), "--pano", *[name] * 30, "--out", str(out)]
+    words += ["--cache", str(scene.parent / "maps")]
     with start_localize(words) as process:
         while "localized at" not in process.stderr.readline():
             pass

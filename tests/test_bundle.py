@@ -308,12 +308,12 @@ def test_photos_of_another_room_are_not_localized():
 
 
 def test_bundles_are_the_same_bits_at_any_number_of_threads():
-    one, two = (_localized(SEED, num_threads, 0.0, WHERE[:2]) for num_threads in (1, 2))
+    one, two = (_localized(SEED, num_threads, 0.0, WHERE[1:]) for num_threads in (1, 2))
     assert _bits(one) == _bits(two)
 
 
 def test_it_does_not_matter_where_the_common_frame_begins():
-    both = (_localized(SEED, 2, far, WHERE[:2]) for far in (0.0, 1e6))
+    both = (_localized(SEED, 2, far, WHERE[1:]) for far in (0.0, 1e6))
     for near, far in zip(*both, strict=True):
         assert pose_errors(near.pose, far.pose)[0] < 1e-5
         assert near.confidence == pytest.approx(far.confidence, abs=1e-4)

@@ -142,18 +142,20 @@ def _photos_and_poses(scene):
 
 def test_scan_localizes_many_together(scene):
     photos, poses = _photos_and_poses(scene)
-    results = scan_of_room(7).localize_bundle(iter(photos), poses, gravity="known")
+    scan = piccolo.open_scan(scene / "cloud.ply", cache=scene.parent / "maps")  # as the command's
+    results = scan.localize_bundle(iter(photos), poses, gravity="known")
     _assert_right(scene, results)
     assert all(piccolo.Result.from_json(r.to_json()).to_json() == r.to_json() for r in results)
     assert results[0].settings["gravity"] == "known"
-    assert scan_of_room(7).localize_bundle([], []) == []
+    assert scan.localize_bundle([], []) == []
 
 
 def test_positions_of_unknown_scale_are_scaled(scene):
     photos, poses = _photos_and_poses(scene)
     doubled = [Pose(pose.R_cam_from_world, 2.0 * pose.center_world) for pose in poses]
     of_any_scale = piccolo.RelativePoses(doubled, "unknown")
-    _assert_right(scene, scan_of_room(7).localize_bundle(photos, of_any_scale, gravity="known"))
+    scan = piccolo.open_scan(scene / "cloud.ply", cache=scene.parent / "maps")
+    _assert_right(scene, scan.localize_bundle(photos, of_any_scale, gravity="known"))
     assert_input_error("`scale`: found 'feet'", piccolo.RelativePoses, doubled, "feet")
 
 

@@ -39,8 +39,9 @@ SUPPORT = Support(NO_CANDIDATE, None, is_found=True, odds=1.0, odds_elsewhere=0.
 
 @pytest.fixture(autouse=True, scope="module")
 def _searched_once():
+    """At any number of threads, of which test_bundle.py has that a search by itself is the same."""
     with pytest.MonkeyPatch.context() as patch:
-        search_alone_once(patch)
+        search_alone_once(patch, is_per_threads=False)
         yield
 
 
