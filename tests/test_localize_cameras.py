@@ -99,7 +99,6 @@ def test_another_blas_changes_no_pose(tmp_path):
     this, pose = place()
     photo = write(tmp_path / "a.png", encoded(render_picture(Mount(PHONE), this, pose, Workers(2)), ".png"))
     words = ["--cloud", rooms.map_path(SEED), "--pano", photo, "--focal", PHONE.focal[0], "--quiet"]
-    words += ["--gravity", "known", "--near", *pose.center_world, 0.5]
     found = []
     for core in ("Haswell", "Prescott"):
         surroundings = {**os.environ, "OPENBLAS_CORETYPE": core}
