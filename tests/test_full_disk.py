@@ -2,6 +2,7 @@
 
 import ast
 import errno
+import re
 from pathlib import Path
 
 import numpy as np
@@ -165,6 +166,7 @@ def test_nothing_is_written_past_the_module_that_knows_of_full_disks():
         for folder in PACKAGES
         for path in sorted(folder.rglob("*.py"))
         if path != Path(atomic.__file__)
+        if not WRITERS.isdisjoint(re.findall(r"\w+", path.read_text()))  # others are not worth parsing
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in WRITERS
     ]
