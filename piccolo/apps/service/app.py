@@ -149,8 +149,7 @@ class Service:
         """Keep a photo, if the service keeps any, and return its name in the folder; else return None."""
         if self.keep is None or result.error is not None:
             return None
-        with refusing_shortage():
-            return await asyncio.to_thread(self.keep.add, task.photo.name, content_of(task), result)
+        return await asyncio.to_thread(self.keep.add, task.photo.name, content_of(task), result)
 
     async def draw(self, desk: Desk, drawing: Drawing, kept: str | None) -> str:
         """Return JSON of a photo's thumbnail and pictures; if it is kept, as `kept`, keep the thumbnail."""
