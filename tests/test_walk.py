@@ -123,9 +123,10 @@ def test_a_walk_goes_on_with_the_same_bits(queries, tmp_path, shown):
     """Narrow frames are matched with those before, which are read again; with any number of threads."""
     is_hidden = abs(np.linspace(-1.0, 1.0, rooms.WIDTH)) > shown
     cv2.imwrite(str(tmp_path / "mask.png"), np.uint8(255) * np.tile(is_hidden, (rooms.WIDTH // 2, 1)))
+    near = piccolo.Prior(near=tuple(queries[1].pose.center_world), radius=0.7)
     ends, lines = [], []
     for num_threads, num_kept in ((2, 0), (1, 2)):
-        walk = rooms.scan(SEED, num_threads).track(gravity="known")
+        walk = rooms.scan(SEED, num_threads).track(gravity="known", prior=near)
         for k, query in enumerate(queries[:4]):
             photo = Photo(query.image, mask=tmp_path / "mask.png")
             if k < num_kept:
